@@ -1,0 +1,197 @@
+"""Parameters as data: type, default, unit, range and meaning of every value in one place.
+
+A law declares its parameters as a frozen dataclass whose fields come from :func:`parameter`; nested
+dataclasses give dotted names (``hysteresis.weights``). The same declaration serves the node (ROS
+descriptors), the YAML files (the layout of ROS parameter files), the engine and the command lines.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import yaml
+
+T = TypeVar("T")
+
+
+class ParameterError(ValueError):
+    """A parameter value that cannot be used; the message names it, its value and what is allowed."""
+
+
+def parameter(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    low: float = -math.inf,
+    high: float = math.inf,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare one parameter as a dataclass field.
+
+    Allowed types are bool, int, float, str, ``tuple[float, ...]`` and ``tuple[str, ...]``. `low` and
+    `high` are inclusive and hold for every element of an array; `choices` lists the allowed strings.
+    """
+    metadata = {
+        "description": description,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "choices": choices,
+    }
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def group(cls: type[T]) -> T:
+    """Declare a nested parameter dataclass; its fields get the dotted name ``field.name``."""
+    return dataclasses.field(default_factory=cls)  # type: ignore[return-value]
+
+
+def declarations(cls: type) -> dict[str, tuple[type, dataclasses.Field]]:
+    """Return ``{dotted name: (type, field)}`` of a parameter dataclass, nested ones included."""
+    hints = get_type_hints(cls)
+    flat: dict[str, tuple[type, dataclasses.Field]] = {}
+    for field in dataclasses.fields(cls):
+        if dataclasses.is_dataclass(hints[field.name]):
+            for name, entry in declarations(hints[field.name]).items():
+                flat[f"{field.name}.{name}"] = entry
+        else:
+            flat[field.name] = (hints[field.name], field)
+    return flat
+
+
+def flatten(parameters: Any) -> dict[str, Any]:
+    """Return ``{dotted name: value}`` of a parameter dataclass instance."""
+    flat: dict[str, Any] = {}
+    for field in dataclasses.fields(parameters):
+        value = getattr(parameters, field.name)
+        if dataclasses.is_dataclass(value):
+            flat.update({f"{field.name}.{name}": v for name, v in flatten(value).items()})
+        else:
+            flat[field.name] = value
+    return flat
+
+
+def build(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
+    """Build `cls` from ``{dotted name: value}``; what is not named keeps its default.
+
+    Raises ParameterError, prefixed by `source` (a file or node name), for an unknown name, a wrong
+    type, a value out of range, and whatever the dataclass' own ``__post_init__`` refuses.
+    """
+    known = declarations(cls)
+    try:
+        for name, value in values.items():
+            if name not in known:
+                raise ParameterError(f"unknown parameter '{name}'; known: {', '.join(known)}")
+            check(name, value, *known[name])
+        return _build(cls, values)
+    except ParameterError as error:
+        raise ParameterError(f"{source}: {error}" if source else str(error)) from None
+
+
+def _build(cls: type[T], values: Mapping[str, Any]) -> T:
+    hints = get_type_hints(cls)
+    arguments: dict[str, Any] = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if dataclasses.is_dataclass(hints[field.name]):
+            prefix = f"{field.name}."
+            nested = {n[len(prefix) :]: v for n, v in values.items() if n.startswith(prefix)}
+            try:
+                arguments[field.name] = _build(hints[field.name], nested)
+            except ParameterError as error:
+                raise ParameterError(f"{prefix}{error}") from None
+        elif field.name in values:
+            value = values[field.name]
+            is_array = hints[field.name] not in (bool, int, float, str)
+            arguments[field.name] = tuple(value) if is_array else value
+    return cls(**arguments)
+
+
+def check(name: str, value: Any, kind: type, field: dataclasses.Field) -> None:
+    """Raise ParameterError unless `value` has the declared type and lies in the declared range."""
+    meta = field.metadata
+    if kind in (bool, int, float, str):
+        if type(value) is not kind:
+            hint = f" (write {value}.0)" if kind is float and type(value) is int else ""
+            raise ParameterError(f"'{name}' is {value!r}, must be of type {kind.__name__}{hint}")
+        elements: tuple = (value,)
+    else:
+        element = str if kind == tuple[str, ...] else float
+        elements = tuple(value) if not isinstance(value, str) else (None,)
+        for index, entry in enumerate(elements):
+            if not isinstance(entry, element):
+                raise ParameterError(f"'{name}[{index}]' is {entry!r}, must be {element.__name__}")
+    for index, entry in enumerate(elements):
+        label = name if len(elements) == 1 else f"{name}[{index}]"
+        if meta["choices"] and entry not in meta["choices"]:
+            raise ParameterError(f"'{label}' is {entry!r}, must be one of {list(meta['choices'])}")
+        if isinstance(entry, (int, float)) and not isinstance(entry, bool):
+            if not meta["low"] <= entry <= meta["high"] or math.isinf(entry):
+                unit = f" {meta['unit']}" if meta["unit"] else ""
+                raise ParameterError(
+                    f"'{label}' is {entry!r}, must be in [{meta['low']:g}, {meta['high']:g}]{unit}"
+                )
+
+
+def load(path: str | Path, node: str) -> dict[str, Any]:
+    """Return ``{dotted name: value}`` that a ROS parameter file gives to the node called `node`.
+
+    Keys match as in ROS 2: an exact name, ``/**`` for every node, ``/**/name`` for a name in any
+    namespace; later matches win. Raises ParameterError naming the file when it cannot be read, is no
+    parameter file or has nothing for `node`.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text())
+    except (OSError, yaml.YAMLError) as error:
+        raise ParameterError(f"{path}: cannot be read as YAML: {error}") from None
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: not a ROS parameter file: the top level is no mapping")
+    values: dict[str, Any] = {}
+    matched = False
+    for key, entry in content.items():
+        pattern = str(key).lstrip("/").replace("**/", "").replace("**", "*")
+        if fnmatch.fnmatchcase(node, pattern):
+            if not isinstance(entry, dict) or not isinstance(entry.get("ros__parameters"), dict):
+                raise ParameterError(f"{path}: '{key}' has no 'ros__parameters' mapping")
+            matched = True
+            values.update(_dotted(entry["ros__parameters"]))
+    if not matched:
+        raise ParameterError(f"{path}: nothing for node '{node}'; it has {list(content)}")
+    return values
+
+
+def _dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            flat.update(_dotted(value, f"{prefix}{key}."))
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def dump(path: str | Path, node: str, parameters: Any, comment: str = "") -> None:
+    """Write `parameters` (a parameter dataclass instance) as a ROS parameter file for `node`.
+
+    `comment` goes on top, each line behind a '#'. Empty arrays are left out: ROS cannot type them.
+    """
+    tree: dict[str, Any] = {}
+    for name, value in flatten(parameters).items():
+        if isinstance(value, tuple):
+            if not value:
+                continue
+            value = list(value)
+        *parents, leaf = name.split(".")
+        branch = tree
+        for parent in parents:
+            branch = branch.setdefault(parent, {})
+        branch[leaf] = value
+    text = "".join(f"# {line}\n" for line in comment.splitlines())
+    content = {f"/**/{node}": {"ros__parameters": tree}}
+    text += yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
+    Path(path).write_text(text)

@@ -1,0 +1,60 @@
+"""A signal that travels ahead of its use: points in time, held or joined by straight lines."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class Profile:
+    """A reference (m) or a tip force (N) over time.
+
+    Parameters
+    ----------
+    time : array_like, shape (n,)
+        Instants in seconds since sample 0, strictly increasing, n >= 1.
+    value : array_like, shape (n,)
+        Values at these instants, finite.
+    linear : bool
+        Straight lines between the points; otherwise value[i] holds until time[i + 1]. Before the first
+        and after the last point the nearest value holds.
+
+    Raises
+    ------
+    ValueError
+        For no points, unequal lengths, numbers that are not finite, or time that does not increase;
+        the message names the index and the value.
+
+    Examples
+    --------
+    >>> Profile([0.0, 0.02], [0.0, 20e-6]).at([0.0, 0.019, 0.02])
+    array([0.e+00, 0.e+00, 2.e-05])
+    """
+
+    def __init__(self, time: ArrayLike, value: ArrayLike, linear: bool = False) -> None:
+        self.time = np.array(time, dtype=float)
+        self.value = np.array(value, dtype=float)
+        self.linear = linear
+        if self.time.ndim != 1 or self.time.shape != self.value.shape or not self.time.size:
+            raise ValueError(
+                f"profile has {self.time.size} instants and {self.value.size} values; "
+                "needs as many of both, at least one"
+            )
+        for name, array in (("time", self.time), ("value", self.value)):
+            bad = np.flatnonzero(~np.isfinite(array))
+            if bad.size:
+                raise ValueError(f"profile {name}[{bad[0]}] is {array[bad[0]]}, must be finite")
+        late = np.flatnonzero(np.diff(self.time) <= 0)
+        if late.size:
+            i = late[0]
+            raise ValueError(
+                f"profile time[{i + 1}] is {self.time[i + 1]:g} s after time[{i}] = "
+                f"{self.time[i]:g} s; must increase"
+            )
+
+    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at `time` (s, any shape)."""
+        if self.linear:
+            return np.interp(time, self.time, self.value)
+        index = np.searchsorted(self.time, time, side="right") - 1
+        return self.value[np.maximum(index, 0)]
