@@ -1,0 +1,245 @@
+"""Run-time feedback law: a discrete state-space controller with two degrees of freedom.
+
+    e_k     = reference_k - deflection_k
+    u_k     = c x_k + d e_k + reference_d r_k
+    command = min(max(u_k, command_low), command_high)
+    x_k+1   = a x_k + b e_k + reference_b r_k + anti_windup (command - u_k)
+
+Reference, deflection and command are in metres: the inverse hysteresis behind the controller makes
+the actuator look like a gain of one. With `reference_b` and `reference_d` left out the controller
+sees the error only. ``controller: none`` is the same law without states and with reference_d = 1,
+that is open loop.
+
+Anti-windup is back-calculation: while the command is at a limit the states follow
+``(a - anti_windup c) x``, which has to be stable, so they stay bounded however long that lasts.
+
+Coefficients come from the ``synthesize`` command line; nothing but numpy is needed here.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from piezo_control.parameters import ParameterError, parameter
+
+
+@dataclasses.dataclass(frozen=True)
+class FeedbackParameters:
+    """Coefficients of the feedback law; matrices are row-major arrays, the order is len(c)."""
+
+    controller: str = parameter(
+        "none",
+        "'state_space' closes the loop with the matrices below, 'none' passes the reference on",
+        choices=("none", "state_space"),
+    )
+    name: str = parameter("open loop", "name of the design, for reports")
+    certified: bool = parameter(
+        False, "true when `synthesize` recomputed the closed loop and every specification was met"
+    )
+    sample_time: float = parameter(
+        1e-4, "sample time the coefficients were designed for", unit="s", low=1e-6, high=1.0
+    )
+    command_low: float = parameter(
+        -22e-6, "lowest command; the end of the inverse's reachable range", unit="m"
+    )
+    command_high: float = parameter(
+        22e-6, "highest command; the end of the inverse's reachable range", unit="m"
+    )
+    a: tuple[float, ...] = parameter((), "state matrix, order x order, row-major")
+    b: tuple[float, ...] = parameter((), "input of the error to the states", unit="1/m")
+    c: tuple[float, ...] = parameter((), "output of the states to the command", unit="m")
+    d: float = parameter(0.0, "direct gain of the error to the command")
+    reference_b: tuple[float, ...] = parameter(
+        (), "input of the reference to the states; none: the error alone", unit="1/m"
+    )
+    reference_d: float = parameter(0.0, "direct gain of the reference to the command")
+    anti_windup: tuple[float, ...] = parameter(
+        (), "input of (limited - unlimited command) to the states", unit="1/m"
+    )
+
+    def __post_init__(self) -> None:
+        if not self.command_low < self.command_high:
+            raise ParameterError(
+                f"'command_low' is {self.command_low!r}, must be below "
+                f"'command_high' ({self.command_high!r}) m"
+            )
+        order = len(self.c)
+        if self.controller == "none":
+            if order or self.a or self.b or self.d or self.reference_b or self.reference_d:
+                raise ParameterError("'controller' is 'none', so the matrices must be left out")
+            return
+        sizes = {"a": order**2, "b": order, "anti_windup": order}
+        if self.reference_b:
+            sizes["reference_b"] = order
+        for name, size in sizes.items():
+            if len(getattr(self, name)) != size:
+                raise ParameterError(
+                    f"'{name}' has {len(getattr(self, name))} elements, must have {size} "
+                    f"for order {order} (the length of 'c')"
+                )
+        if order == 0 and self.d == 0.0:
+            raise ParameterError("'c' is empty and 'd' is 0: the controller has no output")
+        unwound = self.matrix("a") - np.outer(self.anti_windup, self.c)
+        radius = max(abs(np.linalg.eigvals(unwound)), default=0.0)
+        if not radius < 1.0:
+            raise ParameterError(
+                f"'anti_windup' leaves a - anti_windup c with a spectral radius of {radius:.6g}, "
+                "must be below 1: the states would grow while the command is limited"
+            )
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.c)
+
+    def matrix(self, name: str) -> np.ndarray:
+        """Return `a` as an (order, order) array, any other one as an (order,) array.
+
+        An array that was left out is zero.
+        """
+        shape = (self.order, self.order) if name == "a" else (self.order,)
+        values = getattr(self, name)
+        return np.reshape(values, shape) if values else np.zeros(shape)
+
+
+class FeedbackCoefficients(NamedTuple):
+    """What :func:`feedback_step` reads; the arrays are indexables of floats, `a` row-major."""
+
+    a: Sequence[float]
+    b: Sequence[float]
+    c: Sequence[float]
+    d: float
+    reference_b: Sequence[float]
+    reference_d: float
+    anti_windup: Sequence[float]
+    command_low: float
+    command_high: float
+
+
+class FeedbackState(NamedTuple):
+    """What :func:`feedback_step` changes in place: the states and room for the next ones."""
+
+    x: list[float]
+    x_next: list[float]
+
+
+def feedback_coefficients(parameters: FeedbackParameters) -> FeedbackCoefficients:
+    """Return the coefficients of the kernel, as lists of floats."""
+    is_open_loop = parameters.controller == "none"
+    return FeedbackCoefficients(
+        a=list(parameters.a),
+        b=list(parameters.b),
+        c=list(parameters.c),
+        d=parameters.d,
+        reference_b=parameters.matrix("reference_b").tolist(),
+        reference_d=1.0 if is_open_loop else parameters.reference_d,
+        anti_windup=list(parameters.anti_windup),
+        command_low=parameters.command_low,
+        command_high=parameters.command_high,
+    )
+
+
+def feedback_step(
+    coefficients: FeedbackCoefficients, state: FeedbackState, reference: float, deflection: float
+) -> float:
+    """Return the command in m for one sample and advance `state` (see the module's equations)."""
+    k = coefficients
+    x = state.x
+    x_next = state.x_next
+    order = len(x)
+    error = reference - deflection
+    wanted = k.d * error + k.reference_d * reference
+    for i in range(order):
+        wanted += k.c[i] * x[i]
+    command = min(max(wanted, k.command_low), k.command_high)
+    excess = command - wanted
+    for i in range(order):
+        total = k.b[i] * error + k.reference_b[i] * reference + k.anti_windup[i] * excess
+        for j in range(order):
+            total += k.a[i * order + j] * x[j]
+        x_next[i] = total
+    for i in range(order):
+        x[i] = x_next[i]
+    return command
+
+
+class Feedback:
+    """The feedback law with its states.
+
+    Parameters
+    ----------
+    parameters : FeedbackParameters
+
+    Examples
+    --------
+    >>> feedback = Feedback(FeedbackParameters())
+    >>> feedback.step(reference=5e-6, deflection=0.0)
+    5e-06
+    """
+
+    def __init__(self, parameters: FeedbackParameters) -> None:
+        self.parameters = parameters
+        self._coefficients = feedback_coefficients(parameters)
+        self._state = FeedbackState([0.0] * parameters.order, [0.0] * parameters.order)
+
+    def step(self, reference: float, deflection: float) -> float:
+        """Return the command in m for one sample of reference and deflection in m.
+
+        Raises ValueError for an input that is not finite; the states stay as they were.
+        """
+        if not (math.isfinite(reference) and math.isfinite(deflection)):
+            raise ValueError(
+                f"reference {reference!r} m and deflection {deflection!r} m must be finite"
+            )
+        return feedback_step(self._coefficients, self._state, reference, deflection)
+
+    def reset(self) -> None:
+        """Put all states to zero: at rest with zero error and zero command."""
+        self.restore([0.0] * self.parameters.order)
+
+    def start(self, reference: float, deflection: float, command: float) -> None:
+        """Choose the states so that the next step returns `command` (all in m): no bump.
+
+        The states are those of a constant error that would hold the command, so nothing but the
+        error itself moves the command from there on. Also the way to hand over: build the new
+        controller and start it with the last command of the old one. A controller without states
+        (``none``) has nothing to choose: its command is what its equation says. A command outside
+        the limits is limited first.
+
+        Raises ValueError when the controller cannot hold a command (a zero at z = 1).
+        """
+        p = self.parameters
+        n = p.order
+        if n == 0:
+            return
+        command = min(max(command, p.command_low), p.command_high)
+        system = np.zeros((n + 1, n + 1))
+        system[:n, :n] = np.eye(n) - p.matrix("a")
+        system[:n, n] = -p.matrix("b")
+        system[n, :n] = p.c
+        held = command - p.d * (reference - deflection) - p.reference_d * reference
+        right = np.append(p.matrix("reference_b") * reference, held)
+        try:
+            self.restore(np.linalg.solve(system, right)[:n].tolist())
+        except np.linalg.LinAlgError:
+            raise ValueError(
+                f"controller '{p.name}' cannot hold a constant command: it has a zero at z = 1"
+            ) from None
+
+    def snapshot(self) -> list[float]:
+        """Return a copy of the states."""
+        return list(self._state.x)
+
+    def restore(self, snapshot: Sequence[float]) -> None:
+        """Take over states from :meth:`snapshot` of the same controller."""
+        if len(snapshot) != self.parameters.order:
+            raise ValueError(
+                f"snapshot has {len(snapshot)} states, "
+                f"controller '{self.parameters.name}' has {self.parameters.order}"
+            )
+        self._state.x[:] = snapshot
