@@ -1,0 +1,46 @@
+from glob import glob
+from os.path import dirname, join
+
+from setuptools import find_packages, setup
+
+NAME = "piezo_gripper"
+PARAMS = [path for path in glob("params/**", recursive=True) if path.endswith((".yaml", ".xml"))]
+
+
+def shared(paths):
+    """Install each path below share/piezo_gripper, in the folder it has here."""
+    return [(join("share", NAME, dirname(path)), [path]) for path in sorted(paths)]
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Closed-loop control of a piezoelectric gripper finger over ROS 2 topics",
+    author="piezo_gripper developers",
+    maintainer="piezo_gripper developers",
+    maintainer_email="piezo_gripper@example.com",
+    license="Apache-2.0",
+    packages=find_packages(include=["piezo_control*", "piezo_sim*"]),
+    package_data={"": ["*.html", "*.j2", "*.css"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py")]),
+    ],
+    python_requires=">=3.10",
+    install_requires=["setuptools"],
+    extras_require={"test": ["pytest", "hypothesis"]},
+    zip_safe=True,
+    entry_points={
+        "console_scripts": [
+            "cantilever = piezo_sim.cantilever_node:main",
+            "temperature = piezo_sim.temperature_node:main",
+            "feedforward = piezo_control.feedforward_node:main",
+            "feedback = piezo_control.feedback_node:main",
+            "recorder = piezo_sim.recorder_node:main",
+            "experiment = piezo_sim.experiment.cli:main",
+            "identify = piezo_control.identify:main",
+            "synthesize = piezo_control.synthesize:main",
+            "gripper = piezo_control.gripper_node:main",
+        ],
+    },
+)
