@@ -1,0 +1,264 @@
+"""Prandtl-Ishlinskii hysteresis of a piezo actuator and its exact analytic inverse.
+
+The operator is a weighted sum of plays, seen through memoryless one-sided dead zones::
+
+    z_i <- min(u + r_i, max(u - r_i, z_i)),   0 = r_0 < r_1 < ... < r_n         (plays)
+    x   =  sum_i w_i z_i                                                        (hysteresis H)
+    y   =  x + sum_j p_j max(x - a_j, 0) + sum_j q_j min(x + b_j, 0)            (dead zones S)
+
+with the voltage u and the deflection y. Without dead zones y = x is the classical operator, with
+them the modified one for asymmetric actuators. With a rate coefficient b the thresholds r_1 ... r_n
+grow by b |du/dt|, the rate being that of the last voltage step.
+
+The inverse has the same form (P. Janocha, K. Kuhnen, Sensors and Actuators A 79, 2000), so one set
+of step functions serves both. With the partial sums W_i = w_0 + ... + w_i::
+
+    r'_i = sum_{j<=i} w_j (r_i - r_j),  w'_0 = 1/w_0,  w'_i = -w_i / (W_i W_{i-1})
+    z'_i = W_i z_i + sum_{j>i} w_j z_j
+
+It exists if and only if every W_i > 0 (and likewise on each side of the dead zones). A common
+growth b |du/dt| of r_1 ... r_n leaves the order in which plays move untouched, so the inverse stays
+exact with r'_i growing by w_0 b |du/dt|; this needs gaps r_{i+1} - r_i that never shrink for i >= 1.
+The states must belong to a history: abs(z_{i+1} - z_i) <= r_{i+1} - r_i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import NamedTuple
+
+from piezo_control.parameters import ParameterError, parameter
+
+
+@dataclass(frozen=True)
+class HysteresisParameters:
+    """Thresholds and weights of the operator; empty dead zones mean the classical one.
+
+    The defaults give +-22 um at +-40 V and a loop as wide as 18 % of the deflection span
+    (M. Rakotondrabe et al., IFAC 2008, Fig. 5).
+
+    Raises
+    ------
+    ParameterError
+        If the lengths differ, thresholds do not increase, or a partial sum of weights is not
+        positive (no inverse exists); the message names the first offending index.
+    """
+
+    thresholds: tuple[float, ...] = parameter(
+        (0.0, 3.0, 6.0, 9.0, 12.0, 15.0, 18.0, 21.0, 24.0, 27.0, 30.0, 33.0),
+        "play thresholds r_i; the first is 0 (the linear part)",
+        unit="V",
+        low=0.0,
+    )
+    weights: tuple[float, ...] = parameter(
+        (
+            3.0e-7,
+            7.1e-8,
+            6.0e-8,
+            5.0e-8,
+            4.1e-8,
+            3.4e-8,
+            2.8e-8,
+            2.3e-8,
+            1.9e-8,
+            1.7e-8,
+            1.3e-8,
+            1.1e-8,
+        ),
+        "play weights w_i; every partial sum positive",
+        unit="m/V",
+    )
+    upper_thresholds: tuple[float, ...] = parameter(
+        (), "dead zones above: deflections a_j beyond which the slope changes", unit="m", low=0.0
+    )
+    upper_weights: tuple[float, ...] = parameter(
+        (), "dead zones above: slope changes p_j; 1 + every partial sum positive"
+    )
+    lower_thresholds: tuple[float, ...] = parameter(
+        (), "dead zones below: deflections -b_j beyond which the slope changes", unit="m", low=0.0
+    )
+    lower_weights: tuple[float, ...] = parameter(
+        (), "dead zones below: slope changes q_j; 1 + every partial sum positive"
+    )
+    rate_coefficient: float = parameter(
+        0.0, "growth b of the thresholds r_1 ... r_n with abs(du/dt)", unit="s", low=0.0
+    )
+
+    def __post_init__(self) -> None:
+        if not self.thresholds or self.thresholds[0] != 0.0:
+            raise ParameterError(f"'thresholds' is {self.thresholds!r}, must start with 0.0 V")
+        for side, first in (("", 0.0), ("upper_", 1.0), ("lower_", 1.0)):
+            self._check_side(f"{side}thresholds", f"{side}weights", first)
+
+    def _check_side(self, thresholds_name: str, weights_name: str, first: float) -> None:
+        thresholds, weights = getattr(self, thresholds_name), getattr(self, weights_name)
+        if len(weights) != len(thresholds):
+            raise ParameterError(
+                f"'{weights_name}' has {len(weights)} values, must have as many as "
+                f"'{thresholds_name}': {len(thresholds)}"
+            )
+        for i in range(1, len(thresholds)):
+            if not thresholds[i] > thresholds[i - 1]:
+                raise ParameterError(
+                    f"'{thresholds_name}[{i}]' is {thresholds[i]!r}, must be greater than "
+                    f"'{thresholds_name}[{i - 1}]' = {thresholds[i - 1]!r}"
+                )
+        slope = first
+        for i, weight in enumerate(weights):
+            slope += weight
+            if not slope > 0.0:
+                raise ParameterError(
+                    f"'{weights_name}[{i}]' is {weight!r}: the slope {slope:g} up to and with "
+                    f"index {i} must be positive, else no inverse exists"
+                )
+
+
+class Coefficients(NamedTuple):
+    """What the step functions need of an operator or an inverse: lists (or float64 arrays)."""
+
+    thresholds: Sequence[float]
+    weights: Sequence[float]
+    dilation: float  # growth of thresholds[1:] per volt of the last voltage step
+    upper_thresholds: Sequence[float]
+    upper_weights: Sequence[float]
+    lower_thresholds: Sequence[float]
+    lower_weights: Sequence[float]
+
+
+class State(NamedTuple):
+    """What the step functions remember, changed in place: lists (or float64 arrays)."""
+
+    plays: list[float]  # z_i of the operator (V) or z'_i of the inverse (m)
+    drive: list[float]  # last voltage (V) and size of the last voltage step (V)
+
+
+def coefficients(parameters: HysteresisParameters, sample_time: float) -> Coefficients:
+    """Return the operator's coefficients; `sample_time` (s) turns rates into voltage steps."""
+    return Coefficients(
+        list(parameters.thresholds),
+        list(parameters.weights),
+        parameters.rate_coefficient / sample_time,
+        list(parameters.upper_thresholds),
+        list(parameters.upper_weights),
+        list(parameters.lower_thresholds),
+        list(parameters.lower_weights),
+    )
+
+
+def invert(operator: Coefficients) -> Coefficients:
+    """Return the coefficients of the analytic inverse (thresholds r'_i in m, weights w'_i in V/m)."""
+    thresholds, weights = _invert_slopes(operator.thresholds, operator.weights)
+    upper = _invert_side(operator.upper_thresholds, operator.upper_weights)
+    lower = _invert_side(operator.lower_thresholds, operator.lower_weights)
+    return Coefficients(
+        thresholds, weights, operator.weights[0] * operator.dilation, *upper, *lower
+    )
+
+
+def _invert_slopes(
+    thresholds: Sequence[float], weights: Sequence[float]
+) -> tuple[list[float], list[float]]:
+    slopes = list(accumulate(weights))
+    inverse_thresholds = [
+        sum(w * (r - r_j) for w, r_j in zip(weights[:i], thresholds[:i]))
+        for i, r in enumerate(thresholds)
+    ]
+    inverse_weights = [1.0 / slopes[0]] + [
+        -weights[i] / (slopes[i] * slopes[i - 1]) for i in range(1, len(slopes))
+    ]
+    return inverse_thresholds, inverse_weights
+
+
+def _invert_side(
+    thresholds: Sequence[float], weights: Sequence[float]
+) -> tuple[list[float], list[float]]:
+    """Dead zones follow the plays' recursions outward from the unit slope in the middle."""
+    inverse_thresholds, inverse_weights = _invert_slopes([0.0, *thresholds], [1.0, *weights])
+    return inverse_thresholds[1:], inverse_weights[1:]
+
+
+# Step functions: plain scalars and indexables, so that numba can compile them as they are.
+
+
+def plays_output(c: Coefficients, s: State, value: float) -> float:
+    """Return sum w_i z_i for the next input `value`, leaving the plays where they are."""
+    growth = c.dilation * s.drive[1]
+    total = c.weights[0] * value
+    for i in range(1, len(c.weights)):
+        threshold = c.thresholds[i] + growth
+        total += c.weights[i] * min(value + threshold, max(value - threshold, s.plays[i]))
+    return total
+
+
+def plays_move(c: Coefficients, s: State, value: float) -> None:
+    """Move the plays to the input `value`."""
+    growth = c.dilation * s.drive[1]
+    s.plays[0] = value
+    for i in range(1, len(c.weights)):
+        threshold = c.thresholds[i] + growth
+        s.plays[i] = min(value + threshold, max(value - threshold, s.plays[i]))
+
+
+def map_plays(c: Coefficients, s: State) -> None:
+    """Turn plays of `c` into those of its inverse: z'_i = W_i z_i + sum_{j>i} w_j z_j.
+
+    With the coefficients of the inverse it leads back to the operator's plays.
+    """
+    slope = 0.0
+    for i in range(len(c.weights)):
+        slope += c.weights[i]
+    outer = 0.0
+    for i in range(len(c.weights) - 1, -1, -1):
+        play = s.plays[i]
+        s.plays[i] = slope * play + outer
+        outer += c.weights[i] * play
+        slope -= c.weights[i]
+
+
+def dead_zones(c: Coefficients, value: float) -> float:
+    """Return value + sum p_j max(value - a_j, 0) + sum q_j min(value + b_j, 0)."""
+    total = value
+    for j in range(len(c.upper_weights)):
+        total += c.upper_weights[j] * max(value - c.upper_thresholds[j], 0.0)
+    for j in range(len(c.lower_weights)):
+        total += c.lower_weights[j] * min(value + c.lower_thresholds[j], 0.0)
+    return total
+
+
+def remember_voltage(s: State, voltage: float) -> None:
+    """Take note of the voltage applied; the next sample's thresholds follow its step."""
+    s.drive[1] = abs(voltage - s.drive[0])
+    s.drive[0] = voltage
+
+
+def operator_step(operator: Coefficients, s: State, voltage: float) -> float:
+    """Apply `voltage` (V) to the operator and return the deflection (m)."""
+    hysteresis = plays_output(operator, s, voltage)
+    plays_move(operator, s, voltage)
+    remember_voltage(s, voltage)
+    return dead_zones(operator, hysteresis)
+
+
+def inverse_voltage(inverse: Coefficients, s: State, deflection: float) -> float:
+    """Return the voltage (V) that leads the actuator to `deflection` (m); nothing moves yet."""
+    return plays_output(inverse, s, dead_zones(inverse, deflection))
+
+
+def inverse_move(inverse: Coefficients, s: State, deflection: float, voltage: float) -> None:
+    """Move the inverse to `deflection` (m), reached by applying exactly its `voltage` (V)."""
+    plays_move(inverse, s, dead_zones(inverse, deflection))
+    remember_voltage(s, voltage)
+
+
+def inverse_follow(operator: Coefficients, inverse: Coefficients, s: State, voltage: float) -> None:
+    """Move the inverse to where the actuator goes under any other `voltage` (V).
+
+    Used for a clipped voltage, a ramp to 0 V or a homing sweep: the plays are mapped to the
+    actuator's, moved there, and mapped back.
+    """
+    map_plays(inverse, s)
+    plays_move(operator, s, voltage)
+    map_plays(operator, s)
+    remember_voltage(s, voltage)
