@@ -1,0 +1,38 @@
+# Every target makes the environment it needs first (tools/bootstrap.sh), in .venv, build/ and install/ of this checkout.
+SHELL := /bin/bash
+RUN := . ./setup.bash &&
+
+.PHONY: help env demo paper bench test lint clean distclean
+
+help:
+	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
+	@echo "make test       lint and all tests"
+	@echo "make paper      every experiment of the paper; results in out/paper"
+	@echo "make bench      speed of the loop; results in out/bench.json"
+	@echo "make lint       ruff only"
+	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
+	@echo "make clean      remove what was built and the results; distclean: the environment too"
+
+env:
+	@tools/bootstrap.sh
+
+demo: env
+	$(RUN) experiment step --out out/demo
+
+paper: env
+	$(RUN) experiment all --out out/paper
+
+bench: env
+	$(RUN) python bench/run.py --out out/bench.json
+
+test: lint
+	$(RUN) python -m pytest
+
+lint: env
+	$(RUN) ruff check . && ruff format --check .
+
+clean:
+	rm -rf build install log out
+
+distclean: clean
+	rm -rf .venv
