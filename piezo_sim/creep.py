@@ -1,0 +1,70 @@
+"""Creep: slow deflection after a voltage, amplified by temperature.
+
+Source: paper eq. 4 and Fig. 4. A sum of relaxations driven by the voltage,
+
+    Creep = sum c_i,      times_i c_i' = share_i gain(T) U - c_i,
+    gain(T) = max(0, gain + gain_per_degc (T - 22 °C)),
+
+each exact for a voltage and a temperature held within a sample. The gain is a straight line because
+the paper gives two temperatures; outside 22 to 32 °C it is an extrapolation.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from piezo_control.parameters import ParameterError, parameter
+
+
+@dataclass(frozen=True)
+class CreepParameters:
+    """Relaxation times, their shares and the gain: 0.3 µm at 22 °C, 5 µm at 32 °C after 40 V."""
+
+    gain: float = parameter(
+        7.5e-9, "final creep per volt at 22 degC", unit="m/V", low=0.0, high=1e-5
+    )
+    gain_per_degc: float = parameter(
+        1.2e-8, "increase of the gain per degree", unit="m/(V degC)", low=0.0, high=1e-6
+    )
+    times: tuple[float, ...] = parameter(
+        (2.0, 15.0, 110.0), "relaxation times", unit="s", low=1e-6, high=1e9
+    )
+    shares: tuple[float, ...] = parameter(
+        (0.2, 0.3, 0.5), "shares of the relaxations; they sum to 1", low=0.0, high=1.0
+    )
+
+    def __post_init__(self) -> None:
+        if not self.times or len(self.shares) != len(self.times):
+            raise ParameterError(
+                f"'shares' has {len(self.shares)} values, 'times' {len(self.times)}; "
+                "must be as many, one or more"
+            )
+        if abs(sum(self.shares) - 1.0) > 1e-9:
+            raise ParameterError(f"'shares' sums to {sum(self.shares)!r}, must sum to 1")
+
+
+def logarithmic(onset: float, last: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return relaxation (times, weights) whose step response is ln(1 + t / onset) up to `last` (s).
+
+    Trapezoidal rule on 1 / (t + onset) = ∫ exp(-s (t + onset)) ds in log s, two relaxations per
+    decade; the response deviates by less than 0.01 from `onset` / 10 to `last`.
+    """
+    ratio = math.sqrt(10.0)
+    count = math.ceil(math.log(1e3 * last / onset, ratio))
+    times = 0.1 * onset * ratio ** np.arange(count + 1)
+    return times, math.log(ratio) * np.exp(-onset / times)
+
+
+def creep(states, retained, released, drive: float) -> float:
+    """Advance the relaxations by one sample and return their sum (m).
+
+    `retained` is exp(-h / times), `released` is share (1 - retained), `drive` is gain(T) U (m).
+    """
+    total = 0.0
+    for i in range(len(states)):
+        states[i] = retained[i] * states[i] + released[i] * drive
+        total += states[i]
+    return total

@@ -1,0 +1,209 @@
+"""Temperature of the workspace over time, on the grid n * period.
+
+Every profile is a function of the grid index alone: the same parameters give the same value of sample n,
+whatever was asked before. The plant holds grid value n from n * period to (n + 1) * period.
+
+spotlight: a lamp (the paper's Fig. 2) is on for `on_time` at the start of every `repeat_time`; the air
+follows the lamp with first-order `time_constant` (closed form, geometric series over the past pulses).
+random_walk: an Ornstein-Uhlenbeck walk, T[n+1] = base + a (T[n] - base) + amplitude sqrt(1 - a²) N(0, 1),
+a = exp(-period / time_constant), so that `amplitude_degc` is its standard deviation in the long run.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from piezo_control.parameters import ParameterError, parameter
+
+PROFILES = ("constant", "step", "ramp", "sine", "spotlight", "random_walk", "replay")
+CSV_COLUMNS = ("time", "temperature")
+
+
+@dataclass(frozen=True)
+class TemperatureParameters:
+    """Profile of the temperature; values that a profile does not name are not used by it."""
+
+    profile: str = parameter("constant", "shape over time", choices=PROFILES)
+    period: float = parameter(1e-3, "spacing of the grid", unit="s", low=1e-6, high=3600.0)
+    base_degc: float = parameter(
+        22.0,
+        "temperature before the change or around which it moves",
+        unit="degC",
+        low=-50,
+        high=150,
+    )
+    amplitude_degc: float = parameter(
+        10.0,
+        "height of step, ramp, sine or spotlight; standard deviation of the random walk",
+        unit="degC",
+        low=-100.0,
+        high=100.0,
+    )
+    start: float = parameter(
+        0.0, "begin of step, ramp, sine and spotlight", unit="s", low=0.0, high=1e9
+    )
+    duration: float = parameter(10.0, "time the ramp takes", unit="s", low=1e-6, high=1e9)
+    frequency_hz: float = parameter(0.1, "frequency of the sine", unit="Hz", low=0.0, high=1e6)
+    on_time: float = parameter(5.0, "time the spotlight is on", unit="s", low=0.0, high=1e9)
+    repeat_time: float = parameter(
+        10.0, "time from pulse to pulse of the spotlight", unit="s", low=1e-6, high=1e9
+    )
+    time_constant: float = parameter(
+        2.0, "lag of spotlight and random walk", unit="s", low=1e-6, high=1e9
+    )
+    seed: int = parameter(1, "seed of the random walk", low=0, high=2**63 - 1)
+    file: str = parameter(
+        "", "replay: a CSV with the columns time (s), temperature (degC), or a bag folder"
+    )
+    topic: str = parameter(
+        "/temperature", "replay of a bag: topic of type sensor_msgs/msg/Temperature"
+    )
+
+    def __post_init__(self) -> None:
+        if self.profile == "spotlight" and self.on_time > self.repeat_time:
+            raise ParameterError(
+                f"'on_time' is {self.on_time} s, must be at most 'repeat_time' = {self.repeat_time} s"
+            )
+        if self.profile == "replay" and not self.file:
+            raise ParameterError("'file' is empty, the profile 'replay' needs a CSV or a bag")
+
+
+def temperature(parameters: TemperatureParameters, first: int, count: int) -> np.ndarray:
+    """Return the temperatures (°C) number first ... first + count - 1 of the grid, shape (count,).
+
+    Raises ParameterError naming file, column and row when a replayed file cannot be used.
+    """
+    p = parameters
+    if p.profile == "random_walk":
+        return _random_walk(p, first + count)[first:]
+    time = np.arange(first, first + count) * p.period
+    if p.profile == "replay":
+        return np.interp(time, *_recording(p.file, p.topic))
+    return p.base_degc + p.amplitude_degc * _shape(p, time - p.start)
+
+
+def grid_index(sample: np.ndarray | int, sample_time: float, period: float) -> np.ndarray | int:
+    """Return which grid value holds at sample * sample_time; exact, in whole nanoseconds."""
+    return sample * round(sample_time * 1e9) // round(period * 1e9)
+
+
+def _shape(p: TemperatureParameters, time: np.ndarray) -> np.ndarray:
+    """Return the profile between 0 and 1 (sine: -1 and 1); `time` counts from its begin."""
+    since = np.maximum(time, 0.0)
+    if p.profile == "step":
+        return (time >= 0.0).astype(float)
+    if p.profile == "ramp":
+        return np.minimum(since / p.duration, 1.0)
+    if p.profile == "sine":
+        return np.sin(2.0 * math.pi * p.frequency_hz * since)
+    if p.profile == "spotlight":
+        pulse, phase = np.divmod(since, p.repeat_time)
+        decay = math.exp(-p.repeat_time / p.time_constant)
+        heated = -math.expm1(-p.on_time / p.time_constant)
+        after_pulse = heated * math.exp(-(p.repeat_time - p.on_time) / p.time_constant)
+        at_begin = after_pulse * (1.0 - decay**pulse) / (1.0 - decay)
+        lit = -np.expm1(-np.minimum(phase, p.on_time) / p.time_constant)
+        cooling = np.exp(-np.maximum(phase - p.on_time, 0.0) / p.time_constant)
+        return at_begin * np.exp(-phase / p.time_constant) + lit * cooling
+    return np.zeros_like(time)
+
+
+def _random_walk(p: TemperatureParameters, count: int) -> np.ndarray:
+    """Return the walk from its begin, at least `count` values computed once in whole blocks."""
+    blocks = max(1, math.ceil(math.log2(max(count, 1) / 4096)) + 1)
+    return p.base_degc + _walk(p.seed, p.period, p.time_constant, 4096 * 2**blocks)[:count] * (
+        p.amplitude_degc
+    )
+
+
+@functools.lru_cache(maxsize=4)
+def _walk(seed: int, period: float, time_constant: float, count: int) -> np.ndarray:
+    kept = math.exp(-period / time_constant)
+    draws = np.random.Generator(np.random.PCG64(seed)).standard_normal(count)
+    steps = (math.sqrt(1.0 - kept * kept) * draws).tolist()
+    value = 0.0
+    walk = np.empty(count)
+    for n in range(count):
+        walk[n] = value
+        value = kept * value + steps[n]
+    return walk
+
+
+@functools.lru_cache(maxsize=4)
+def _recording(file: str, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    path = Path(file)
+    if path.is_dir():
+        time, values = _read_bag(path, topic)
+    else:
+        time, values = _read_csv(path)
+    late = np.flatnonzero(np.diff(time) <= 0.0)
+    if late.size:
+        raise ParameterError(
+            f"{file}: column 'time', row {late[0] + 2}: {time[late[0] + 1]} s comes after "
+            f"{time[late[0]]} s, must increase"
+        )
+    return time, values
+
+
+def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read: {error}") from None
+    names = [name.strip() for name in lines[0].split(",")] if lines else []
+    for name in CSV_COLUMNS:
+        if name not in names:
+            raise ParameterError(f"{path}: column '{name}' is missing; it has {names}")
+    columns: tuple[list[float], ...] = ([], [])
+    for row, line in enumerate(lines[1:], start=1):
+        cells = line.split(",")
+        for name, column in zip(CSV_COLUMNS, columns):
+            try:
+                value = float(cells[names.index(name)])
+            except (ValueError, IndexError):
+                value = math.nan
+            if not math.isfinite(value):
+                raise ParameterError(
+                    f"{path}: column '{name}', row {row}: {line!r} has no finite number there"
+                )
+            column.append(value)
+    if not columns[0]:
+        raise ParameterError(f"{path}: has no rows")
+    return np.array(columns[0]), np.array(columns[1])
+
+
+def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps (s, from the first one on) and temperatures of a bag's topic."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            found = [c for c in reader.connections if c.topic == topic]
+            if not found:
+                topics = sorted({c.topic for c in reader.connections})
+                raise ParameterError(f"{path}: topic '{topic}' is missing; it has {topics}")
+            if found[0].msgtype != "sensor_msgs/msg/Temperature":
+                raise ParameterError(
+                    f"{path}: topic '{topic}' is of type {found[0].msgtype}, "
+                    "must be sensor_msgs/msg/Temperature"
+                )
+            nanoseconds = []
+            values = []
+            for connection, _, raw in reader.messages(connections=found):
+                message = reader.deserialize(raw, connection.msgtype)
+                stamp = message.header.stamp
+                nanoseconds.append(stamp.sec * 10**9 + stamp.nanosec)
+                values.append(message.temperature)
+    except AnyReaderError as error:
+        raise ParameterError(f"{path}: cannot be read as a bag: {error}") from None
+    bad = [n for n, value in enumerate(values) if not math.isfinite(value)]
+    if bad or not values:
+        what = f"message {bad[0]} is {values[bad[0]]} degC" if bad else "has no messages"
+        raise ParameterError(f"{path}: topic '{topic}': {what}, must be finite")
+    return (np.array(nanoseconds) - nanoseconds[0]) * 1e-9, np.array(values)
