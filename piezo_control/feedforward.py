@@ -18,11 +18,11 @@ from piezo_control.hysteresis import (
     HysteresisParameters,
     State,
     coefficients,
-    dead_zones,
     inverse_follow,
     inverse_move,
     inverse_voltage,
     invert,
+    reachable_range,
     remember_voltage,
 )
 from piezo_control.parameters import group, parameter
@@ -138,11 +138,7 @@ class Feedforward:
         if not c.inverting:
             high = c.static_gain * c.voltage_limit
             return -high, high
-        hysteresis = sum(
-            w * max(c.voltage_limit - r, 0.0)
-            for w, r in zip(c.operator.weights, c.operator.thresholds)
-        )
-        return dead_zones(c.operator, -hysteresis), dead_zones(c.operator, hysteresis)
+        return reachable_range(c.operator, c.voltage_limit)
 
     def snapshot(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
         """Return a copy of the state, for :meth:`restore`."""

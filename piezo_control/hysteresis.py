@@ -26,8 +26,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from piezo_control.parameters import ParameterError, parameter
 
@@ -149,34 +151,31 @@ def coefficients(parameters: HysteresisParameters, sample_time: float) -> Coeffi
 
 def invert(operator: Coefficients) -> Coefficients:
     """Return the coefficients of the analytic inverse (thresholds r'_i in m, weights w'_i in V/m)."""
-    thresholds, weights = _invert_slopes(operator.thresholds, operator.weights)
-    upper = _invert_side(operator.upper_thresholds, operator.upper_weights)
-    lower = _invert_side(operator.lower_thresholds, operator.lower_weights)
+    thresholds, weights = _invert_side(
+        operator.weights[0], operator.thresholds[1:], operator.weights[1:]
+    )
     return Coefficients(
-        thresholds, weights, operator.weights[0] * operator.dilation, *upper, *lower
+        [0.0, *thresholds],
+        [1.0 / operator.weights[0], *weights],
+        operator.weights[0] * operator.dilation,
+        *_invert_side(1.0, operator.upper_thresholds, operator.upper_weights),
+        *_invert_side(1.0, operator.lower_thresholds, operator.lower_weights),
     )
 
 
-def _invert_slopes(
-    thresholds: Sequence[float], weights: Sequence[float]
-) -> tuple[list[float], list[float]]:
-    slopes = list(accumulate(weights))
-    inverse_thresholds = [
-        sum(w * (r - r_j) for w, r_j in zip(weights[:i], thresholds[:i]))
-        for i, r in enumerate(thresholds)
-    ]
-    inverse_weights = [1.0 / slopes[0]] + [
-        -weights[i] / (slopes[i] * slopes[i - 1]) for i in range(1, len(slopes))
-    ]
-    return inverse_thresholds, inverse_weights
-
-
 def _invert_side(
-    thresholds: Sequence[float], weights: Sequence[float]
+    slope: float, thresholds: Sequence[float], weights: Sequence[float]
 ) -> tuple[list[float], list[float]]:
-    """Dead zones follow the plays' recursions outward from the unit slope in the middle."""
-    inverse_thresholds, inverse_weights = _invert_slopes([0.0, *thresholds], [1.0, *weights])
-    return inverse_thresholds[1:], inverse_weights[1:]
+    """Follow the recursion outward from the `slope` in the middle, over plays or dead zones."""
+    inverse_thresholds, inverse_weights = [], []
+    position, reached = 0.0, 0.0
+    for threshold, weight in zip(thresholds, weights, strict=True):
+        reached += slope * (threshold - position)
+        position = threshold
+        inverse_thresholds.append(reached)
+        inverse_weights.append(-weight / (slope * (slope + weight)))
+        slope += weight
+    return inverse_thresholds, inverse_weights
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
@@ -262,3 +261,211 @@ def inverse_follow(operator: Coefficients, inverse: Coefficients, s: State, volt
     plays_move(operator, s, voltage)
     map_plays(operator, s)
     remember_voltage(s, voltage)
+
+
+def reachable_range(operator: Coefficients, voltage_limit: float) -> tuple[float, float]:
+    """Return the lowest and highest deflection (m) a homed actuator reaches within +-limit (V).
+
+    Beyond it the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
+    """
+    hysteresis = sum(
+        weight * max(voltage_limit - threshold, 0.0)
+        for weight, threshold in zip(operator.weights, operator.thresholds, strict=True)
+    )
+    return dead_zones(operator, -hysteresis), dead_zones(operator, hysteresis)
+
+
+def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:
+    """Raise ParameterError, naming the index, unless some history leads to these plays (V)."""
+    if len(plays) != len(thresholds):
+        raise ParameterError(f"{len(plays)} plays given, must be {len(thresholds)}")
+    for i in range(1, len(plays)):
+        gap = thresholds[i] - thresholds[i - 1]
+        if not abs(plays[i] - plays[i - 1]) <= gap * (1.0 + 1e-9):
+            raise ParameterError(
+                f"plays[{i}] is {plays[i]!r}, must be within {gap:g} V of plays[{i - 1}] = "
+                f"{plays[i - 1]!r}: no history leads there"
+            )
+
+
+class _Memory:
+    """The state of plays and its restoration, common to operator and inverse."""
+
+    def __init__(self, state: State) -> None:
+        self.state = state
+        self._initial = self.snapshot()
+
+    def snapshot(self) -> State:
+        """Return a copy of the state, for :meth:`restore`."""
+        return State(list(self.state.plays), list(self.state.drive))
+
+    def restore(self, snapshot: State) -> None:
+        """Go back to the state of a snapshot."""
+        self.state = State(list(snapshot.plays), list(snapshot.drive))
+
+    def reset(self) -> None:
+        """Go back to the initial state."""
+        self.restore(self._initial)
+
+
+class Hysteresis(_Memory):
+    """Operator of one actuator; `step` takes one voltage, a call takes a history of them.
+
+    Parameters
+    ----------
+    parameters : HysteresisParameters
+    sample_time : float
+        Time between steps (s); only rate-dependent thresholds depend on it.
+    plays : sequence of float, optional
+        Initial states z_i (V), which must belong to some history; a homed actuator's are all 0.
+
+    Raises
+    ------
+    ParameterError
+        If `plays` has a wrong length or cannot be reached by any history; it names the index.
+
+    Examples
+    --------
+    >>> actuator = Hysteresis(HysteresisParameters())
+    >>> inverse = actuator.inverse()
+    >>> round(actuator.step(inverse.step(7e-6)), 12)
+    7e-06
+    """
+
+    def __init__(
+        self,
+        parameters: HysteresisParameters,
+        sample_time: float = 1.0,
+        plays: Sequence[float] | None = None,
+    ) -> None:
+        self.coefficients = coefficients(parameters, sample_time)
+        if plays is None:
+            plays = [0.0] * len(parameters.thresholds)
+        check_plays(parameters.thresholds, plays)
+        super().__init__(State(list(plays), [plays[0], 0.0]))
+
+    def step(self, voltage: float) -> float:
+        """Apply one `voltage` (V) and return the deflection (m)."""
+        return operator_step(self.coefficients, self.state, voltage)
+
+    def __call__(self, voltage: ArrayLike) -> NDArray[np.float64]:
+        """Apply a history of voltages (V, 1-D) and return the deflections (m), of equal shape."""
+        return np.array([self.step(v) for v in np.asarray(voltage, float).tolist()])
+
+    def inverse(self) -> InverseHysteresis:
+        """Return the inverse that compensates this actuator from its present state on."""
+        return InverseHysteresis(self.coefficients, self.snapshot())
+
+
+class InverseHysteresis(_Memory):
+    """Analytic inverse of an actuator with the coefficients `operator`, in the state `actuator`."""
+
+    def __init__(self, operator: Coefficients, actuator: State) -> None:
+        self.operator = operator
+        self.coefficients = invert(operator)
+        map_plays(operator, actuator)
+        super().__init__(actuator)
+
+    def step(self, deflection: float) -> float:
+        """Return the voltage (V) that leads the actuator to `deflection` (m)."""
+        voltage = inverse_voltage(self.coefficients, self.state, deflection)
+        inverse_move(self.coefficients, self.state, deflection, voltage)
+        return voltage
+
+    def __call__(self, deflection: ArrayLike) -> NDArray[np.float64]:
+        """Return the voltages (V) for a history of deflections (m, 1-D), of equal shape."""
+        return np.array([self.step(d) for d in np.asarray(deflection, float).tolist()])
+
+    def follow(self, voltage: float) -> None:
+        """Take note of a `voltage` (V) that was applied instead of one of `step`."""
+        inverse_follow(self.operator, self.coefficients, self.state, voltage)
+
+    def actuator_plays(self) -> list[float]:
+        """Return the states z_i (V) of the actuator this inverse belongs to."""
+        actuator = self.snapshot()
+        map_plays(self.coefficients, actuator)
+        return actuator.plays
+
+
+class HysteresisBatch:
+    """Operators of many actuators at once, on arrays with one entry per actuator.
+
+    Parameters
+    ----------
+    parameters : sequence of HysteresisParameters
+        One per actuator, all with equally many plays and dead zones; each starts homed.
+    sample_time : float
+        Time between steps (s).
+    inverse : bool
+        Compute voltages from deflections instead.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[HysteresisParameters],
+        sample_time: float = 1.0,
+        inverse: bool = False,
+    ) -> None:
+        each = [coefficients(p, sample_time) for p in parameters]
+        if inverse:
+            each = [invert(c) for c in each]
+        self._inverse = inverse
+        self._c = Coefficients(*(np.array(entry) for entry in zip(*each, strict=True)))
+        self._growing = np.arange(self._c.weights.shape[1]) > 0
+        self.plays = np.zeros_like(self._c.weights)
+        self._voltage = np.zeros(len(each))
+        self._voltage_step = np.zeros(len(each))
+
+    def step(self, value: ArrayLike) -> NDArray[np.float64]:
+        """Take one voltage (V) per actuator and return the deflections (m); inverse: m to V."""
+        value = np.asarray(value, float)
+        drive = self._dead_zones(value) if self._inverse else value
+        growth = (self._c.dilation * self._voltage_step)[:, None] * self._growing
+        threshold = self._c.thresholds + growth
+        drive = drive[:, None]
+        self.plays = np.minimum(drive + threshold, np.maximum(drive - threshold, self.plays))
+        total = np.sum(self._c.weights * self.plays, axis=1)
+        result, voltage = (total, total) if self._inverse else (self._dead_zones(total), value)
+        self._voltage_step = np.abs(voltage - self._voltage)
+        self._voltage = voltage
+        return result
+
+    def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Apply a history, shape (samples, actuators); return one of equal shape."""
+        return np.array([self.step(value) for value in np.asarray(values, float)])
+
+    def _dead_zones(self, value: NDArray) -> NDArray:
+        above = np.maximum(value[:, None] - self._c.upper_thresholds, 0.0)
+        below = np.minimum(value[:, None] + self._c.lower_thresholds, 0.0)
+        return (
+            value
+            + np.sum(self._c.upper_weights * above, axis=1)
+            + np.sum(self._c.lower_weights * below, axis=1)
+        )
+
+
+def play_history(
+    thresholds: ArrayLike, voltage: ArrayLike, plays: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Return the states of plays under a voltage history, as regressors of an identification.
+
+    Parameters
+    ----------
+    thresholds : 1-D array with shape (plays,), or (samples, plays) where they change (V)
+    voltage : 1-D array with shape (samples,) (V)
+    plays : 1-D array with shape (plays,), optional
+        States before the first sample (V), default 0.
+
+    Returns
+    -------
+    2-D array with shape (samples, plays) (V)
+    """
+    voltage = np.asarray(voltage, float)[:, None]
+    history = voltage - thresholds
+    upper = voltage + thresholds
+    state = np.zeros(history.shape[1]) if plays is None else np.asarray(plays, float)
+    for sample in range(len(history)):
+        np.maximum(history[sample], state, out=history[sample])
+        np.minimum(history[sample], upper[sample], out=history[sample])
+        state = history[sample]
+    return history
