@@ -10,8 +10,8 @@ with the voltage u and the deflection y. Without dead zones y = x is the classic
 them the modified one for asymmetric actuators. With a rate coefficient b the thresholds r_1 ... r_n
 grow by b |du/dt|, the rate being that of the last voltage step.
 
-The inverse has the same form (P. Janocha, K. Kuhnen, Sensors and Actuators A 79, 2000), so one set
-of step functions serves both. With the partial sums W_i = w_0 + ... + w_i::
+The inverse has the same form, so one set of step functions serves both. With the partial sums
+W_i = w_0 + ... + w_i::
 
     r'_i = sum_{j<=i} w_j (r_i - r_j),  w'_0 = 1/w_0,  w'_i = -w_i / (W_i W_{i-1})
     z'_i = W_i z_i + sum_{j>i} w_j z_j
@@ -20,6 +20,10 @@ It exists if and only if every W_i > 0 (and likewise on each side of the dead zo
 growth b |du/dt| of r_1 ... r_n leaves the order in which plays move untouched, so the inverse stays
 exact with r'_i growing by w_0 b |du/dt|; this needs gaps r_{i+1} - r_i that never shrink for i >= 1.
 The states must belong to a history: abs(z_{i+1} - z_i) <= r_{i+1} - r_i.
+
+Sources: H. Janocha, K. Kuhnen, Sensors and Actuators A 79 (2000) 83 (inverse); K. Kuhnen, European
+Journal of Control 9 (2003) 407 (modified); M. Al Janaideh, P. Krejci, IEEE/ASME Transactions on
+Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
 """
 
 from __future__ import annotations
@@ -55,20 +59,7 @@ class HysteresisParameters:
         low=0.0,
     )
     weights: tuple[float, ...] = parameter(
-        (
-            3.0e-7,
-            7.1e-8,
-            6.0e-8,
-            5.0e-8,
-            4.1e-8,
-            3.4e-8,
-            2.8e-8,
-            2.3e-8,
-            1.9e-8,
-            1.7e-8,
-            1.3e-8,
-            1.1e-8,
-        ),
+        (300e-9, 71e-9, 60e-9, 50e-9, 41e-9, 34e-9, 28e-9, 23e-9, 19e-9, 17e-9, 13e-9, 11e-9),
         "play weights w_i; every partial sum positive",
         unit="m/V",
     )
