@@ -58,3 +58,27 @@ class Profile:
             return np.interp(time, self.time, self.value)
         index = np.searchsorted(self.time, time, side="right") - 1
         return self.value[np.maximum(index, 0)]
+
+
+class SampledProfile:
+    """A profile read sample by sample: ``sampled[k]`` is the value at k * sample_time, as a float.
+
+    Values are computed in blocks, because one look-up at a time costs more than the control law.
+    """
+
+    BLOCK = 1024
+
+    def __init__(self, profile: Profile, sample_time: float) -> None:
+        self.profile = profile
+        self.sample_time = sample_time
+        self._first = 0
+        self._values: list[float] = []
+
+    def __getitem__(self, number: int) -> float:
+        index = number - self._first
+        if not 0 <= index < len(self._values):
+            self._first = number
+            index = 0
+            numbers = np.arange(number, number + self.BLOCK)
+            self._values = self.profile.at(numbers * self.sample_time).tolist()
+        return self._values[index]

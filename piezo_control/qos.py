@@ -1,0 +1,16 @@
+"""Quality of service by role (REP-2003)."""
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+# Numbered samples: reliable, and deep enough that a recorder may fall behind by seconds.
+SAMPLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
+
+# Set-points: reliable, only the newest counts.
+SETPOINT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+
+# Profiles and states: the newest is kept for those who join later.
+LATCHED = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
