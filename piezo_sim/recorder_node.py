@@ -98,6 +98,7 @@ class RecorderNode(FingerNode):
         self.typestore = get_typestore(Stores.ROS2_JAZZY)
         self.writer: Writer | None = None
         self.inputs: list[Any] = []
+        self.latched: dict[str, bytes] = {}
         self.tracks: dict[str, Track] = {}
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -107,17 +108,18 @@ class RecorderNode(FingerNode):
         except ValueError as error:
             self.get_logger().error(f"not configured: {error}")
             return TransitionCallbackReturn.FAILURE
+        self.types = types
         for topic, (name, qos) in types.items():
             package, _, kind = name.split("/")
             message = getattr(importlib.import_module(f"{package}.msg"), kind)
             write = partial(self._write, topic)
             self.inputs.append(self.create_subscription(message, topic, write, qos, raw=True))
-        self.types = types
         return super().on_configure(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         while self.inputs:
             self.destroy_subscription(self.inputs.pop())
+        self.latched.clear()
         return super().on_cleanup(state)
 
     def start(self) -> None:
@@ -142,6 +144,8 @@ class RecorderNode(FingerNode):
             has_header = bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
             self.tracks[topic] = Track(topic, connection, has_header)
         self.writer = writer
+        for topic, data in self.latched.items():
+            self._write(topic, data)
 
     def stop(self) -> None:
         writer, self.writer = self.writer, None
@@ -169,6 +173,8 @@ class RecorderNode(FingerNode):
         return offers[0].topic_type, qos
 
     def _write(self, topic: str, data: bytes) -> None:
+        if self.types[topic][1].durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            self.latched[topic] = data  # what a profile said before the run began belongs to the run
         if self.writer is None:
             return
         track = self.tracks[topic]

@@ -1,0 +1,93 @@
+"""Node processes: started together, watched, and never left behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from ament_index_python.packages import get_package_prefix
+
+PACKAGE = "piezo_gripper"
+GRACE = 5.0  # s that a node has to stop after SIGTERM
+LOG_TAIL = 5  # lines of a dead node's log shown in the error
+PR_SET_PDEATHSIG = 1
+
+
+class NodeDied(RuntimeError):
+    """A node process ended although the experiment still needs it."""
+
+
+def end_with_parent() -> None:
+    """Ask Linux to stop this process when its parent dies, even by SIGKILL."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class NodeProcesses:
+    """Processes of the package's executables; use as a context manager.
+
+    Parameters
+    ----------
+    commands : mapping of str to sequence of str
+        Executable name to its command-line arguments.
+    log_folder : Path
+        Gets one log file per node.
+    """
+
+    def __init__(self, commands: Mapping[str, Sequence[str]], log_folder: Path) -> None:
+        self._commands = commands
+        self._log_folder = log_folder
+        self._running: dict[str, subprocess.Popen] = {}
+
+    def __enter__(self) -> NodeProcesses:
+        executables = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
+        self._log_folder.mkdir(parents=True, exist_ok=True)
+        try:
+            for name, arguments in self._commands.items():
+                with self._log(name).open("wb") as log:
+                    self._running[name] = subprocess.Popen(
+                        [str(executables / name), *arguments],
+                        stdin=subprocess.DEVNULL,
+                        stdout=log,
+                        stderr=subprocess.STDOUT,
+                        start_new_session=True,
+                        preexec_fn=end_with_parent,
+                    )
+        except OSError:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def __len__(self) -> int:
+        return len(self._running)
+
+    def check(self) -> None:
+        """Raise NodeDied, naming node, exit code and last words, if a process has ended."""
+        for name, process in self._running.items():
+            code = process.poll()
+            if code is not None:
+                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended ({code})"
+                words = self._log(name).read_text(errors="replace").splitlines()[-LOG_TAIL:]
+                raise NodeDied("\n  ".join([f"node '{name}' {how}; log {self._log(name)}", *words]))
+
+    def stop(self) -> None:
+        """End every process: SIGTERM, and SIGKILL for what is still there after the grace period."""
+        for process in self._running.values():
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGTERM)
+        for process in self._running.values():
+            try:
+                process.wait(GRACE)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+        self._running.clear()
+
+    def _log(self, name: str) -> Path:
+        return self._log_folder / f"{name}.log"
