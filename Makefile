@@ -17,7 +17,7 @@ env:
 	@tools/bootstrap.sh
 
 demo: env
-	$(RUN) experiment step --out out/demo
+	$(RUN) experiment step --out out/demo --overwrite
 
 paper: env
 	$(RUN) experiment all --out out/paper

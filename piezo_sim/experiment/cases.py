@@ -88,7 +88,9 @@ class Case:
         parameters = {}
         for name, kind in NODES.items():
             values = load(files[name], name) if name in files else {}
-            parameters[name] = build(kind, {**values, **changes[name]}, f"case '{self.name}': {name}")
+            parameters[name] = build(
+                kind, {**values, **changes[name]}, f"case '{self.name}': {name}"
+            )
         return parameters
 
 
@@ -154,7 +156,9 @@ def profile(shape: Mapping[str, Any], unit: str, scale: float, where: str) -> Pr
     kind = values.pop("shape", None)
     try:
         if kind == "points":
-            made = Profile(values.pop("time"), np.multiply(values.pop(f"value_{unit}"), scale), True)
+            made = Profile(
+                values.pop("time"), np.multiply(values.pop(f"value_{unit}"), scale), True
+            )
         elif kind == "step":
             height, start = values.pop(f"amplitude_{unit}") * scale, values.pop("start", 0.0)
             made = Profile([start], [height]) if start == 0 else Profile([0, start], [0, height])
@@ -169,4 +173,3 @@ def profile(shape: Mapping[str, Any], unit: str, scale: float, where: str) -> Pr
     if values:
         raise ParameterError(f"{where}: shape '{kind}' does not know {sorted(values)}")
     return made
-

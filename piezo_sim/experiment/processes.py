@@ -72,7 +72,9 @@ class NodeProcesses:
         for name, process in self._running.items():
             code = process.poll()
             if code is not None:
-                how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended ({code})"
+                how = (
+                    f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended ({code})"
+                )
                 words = self._log(name).read_text(errors="replace").splitlines()[-LOG_TAIL:]
                 raise NodeDied("\n  ".join([f"node '{name}' {how}; log {self._log(name)}", *words]))
 

@@ -47,7 +47,8 @@ def run_cases(
     spin.init()
     stop = spin.stop_event()
     commands = {
-        name: ["--ros-args", "-r", f"__ns:=/{namespace}", "-p", "autostart:=false"] for name in NODES
+        name: ["--ros-args", "-r", f"__ns:=/{namespace}", "-p", "autostart:=false"]
+        for name in NODES
     }
     try:
         with NodeProcesses(commands, out / "log") as processes:
@@ -61,7 +62,9 @@ def run_cases(
             try:
                 conductor.wait_for_nodes()
                 for case in cases:
-                    yield run_case(case, conductor, out / "bags" / case.name, len(processes), progress)
+                    yield run_case(
+                        case, conductor, out / "bags" / case.name, len(processes), progress
+                    )
             finally:
                 conductor.close()
     finally:

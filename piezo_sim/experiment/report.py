@@ -1,0 +1,59 @@
+"""A self-contained page of figures and tables, and the same tables on the terminal."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader
+from rich.console import Console
+from rich.table import Table
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with text, figures (PNG file and caption) and a table of cells."""
+
+    title: str
+    text: str = ""
+    figures: Sequence[tuple[Path, str]] = ()
+    columns: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = field(default_factory=list)
+
+
+def write_html(path: Path, title: str, sections: Iterable[Section], footer: str = "") -> None:
+    """Write `sections` as one HTML file with the pictures inside."""
+    template = Environment(
+        loader=PackageLoader("piezo_sim.experiment", "."), autoescape=True
+    ).get_template("report.html.j2")
+    pages = [
+        {
+            "title": section.title,
+            "text": section.text,
+            "columns": section.columns,
+            "rows": section.rows,
+            "figures": [
+                {"caption": caption, "data": base64.b64encode(png.read_bytes()).decode()}
+                for png, caption in section.figures
+            ],
+        }
+        for section in sections
+    ]
+    path.write_text(template.render(title=title, sections=pages, footer=footer))
+
+
+def print_table(console: Console, section: Section) -> None:
+    """Print the section's table on the terminal."""
+    table = Table(title=section.title)
+    for column in section.columns:
+        table.add_column(column, justify="left" if column == section.columns[0] else "right")
+    for row in section.rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def cell(value: float | None, digits: int = 2) -> str:
+    """Return a number as a table shows it; None, a figure that does not exist, is a dash."""
+    return "–" if value is None else f"{value:.{digits}f}"
