@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import deque
 from time import monotonic
 
+import numpy as np
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
@@ -29,6 +31,7 @@ from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_sim.cantilever import Cantilever, CantileverParameters
 
 STATE_PERIOD = 0.1  # s
+JITTER_WINDOW = 10000  # periods
 RETRY_PERIOD = 0.1  # s
 
 
@@ -79,6 +82,7 @@ class CantileverNode(FingerNode):
         self.tick = self.create_timer(1.0, self._tick, autostart=False)
         self.phase = FingerState.IDLE
         self.text = ""
+        self.ticks: deque[float] = deque(maxlen=JITTER_WINDOW)
         self._reset()
 
     def _reset(self) -> None:
@@ -113,6 +117,7 @@ class CantileverNode(FingerNode):
             self.watchdog.reset()
             self._measure()
         else:
+            self.ticks.clear()
             self.tick.timer_period_ns = round(self.parameters.sample_time * 1e9)
             self.tick.reset()
 
@@ -164,7 +169,7 @@ class CantileverNode(FingerNode):
                 f"'temperature' is {message.temperature} °C, must be finite; ignored",
                 throttle_duration_sec=1.0,
             )
-        elif not self.parameters.temperature_lockstep:
+        elif self.parameters.mode == "free_running" or not self.parameters.temperature_lockstep:
             self.temperature = message.temperature
         elif self.active:
             stamp = message.header.stamp
@@ -236,6 +241,7 @@ class CantileverNode(FingerNode):
 
     def _tick(self) -> None:
         p = self.parameters
+        self.ticks.append(monotonic())
         sample = Sample(number=self.number)
         sample.header.stamp = self.get_clock().now().to_msg()
         sample.value = self.plant.measure()
@@ -287,6 +293,9 @@ class CantileverNode(FingerNode):
         state.temperature = self.temperature
         state.clipped = self.plant.clipped
         state.asked_again = self.asked_again
+        if len(self.ticks) > 1:
+            late = np.abs(np.diff(self.ticks) - self.parameters.sample_time)
+            state.jitter = float(np.quantile(late, 0.999))
         self.states.publish(state)
 
 

@@ -1,0 +1,45 @@
+"""One finger: cantilever, temperature, feedforward and feedback, started and active in one namespace."""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = {
+    "namespace": ("finger", "namespace of the finger's nodes and topics"),
+    "controller": ("robust", "controller: params/feedback_<controller>.yaml"),
+    "mode": ("lockstep", "lockstep or free_running"),
+    "sample_time": ("0.0001", "sample time in s; that of the controller's design"),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    params = PathJoinSubstitution([FindPackageShare("piezo_gripper"), "params"])
+    controller = ["feedback_", LaunchConfiguration("controller"), ".yaml"]
+    common = {"mode": LaunchConfiguration("mode")}
+    sampled = {**common, "sample_time": LaunchConfiguration("sample_time")}
+    nodes = {
+        "temperature": ("temperature.yaml", common),
+        "feedforward": ("feedforward.yaml", sampled),
+        "feedback": (controller, common),
+        "cantilever": ("cantilever.yaml", {**sampled, "temperature_lockstep": True}),
+    }
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=value, description=text)
+                for name, (value, text) in ARGUMENTS.items()
+            ),
+            *(
+                Node(
+                    package="piezo_gripper",
+                    executable=name,
+                    namespace=LaunchConfiguration("namespace"),
+                    parameters=[PathJoinSubstitution([params, file]), changes],
+                    output="screen",
+                )
+                for name, (file, changes) in nodes.items()
+            ),
+        ]
+    )

@@ -1,0 +1,7 @@
+"""Every test session has a ROS domain of its own and stays on this machine."""
+
+import os
+
+# 1 … 101 are safe on every platform; neighbours on the same machine rarely share a process id's remainder.
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"

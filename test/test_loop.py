@@ -1,0 +1,165 @@
+"""The loop over topics: real node processes, real bags."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rich.progress import Progress
+from rosbags.highlevel import AnyReader
+
+from piezo_control.profile import Profile
+from piezo_control.recording import read
+from piezo_sim import engine
+from piezo_sim.experiment.cases import NODES, Case
+from piezo_sim.experiment.processes import NodeDied
+from piezo_sim.experiment.runner import run_cases
+
+SAMPLES = 600
+LOOP = ("deflection", "command", "voltage")
+WARM_UP = {"profile": "ramp", "base_degc": 22.0, "amplitude_degc": 10.0, "duration": 0.05}
+
+
+def closed_loop(name: str, samples: int = SAMPLES) -> Case:
+    """A case that uses everything: feedback, a moving reference, warm-up and a tip force."""
+    return Case(
+        name=name,
+        mode="feedback",
+        controller="paper",
+        plant="prandtl_ishlinskii",
+        sample_time=1e-4,
+        duration=samples * 1e-4,
+        reference=Profile([0.0, 0.02, 0.04], [5e-6, 20e-6, -10e-6], linear=True),
+        tip_force=Profile([0.0, 0.03], [0.0, 1e-3]),
+        temperature=WARM_UP,
+    )
+
+
+def children() -> dict[str, int]:
+    """Executable name to process id of this process' children."""
+    found = {}
+    for process in Path(f"/proc/{os.getpid()}/task").glob("*/children"):
+        for pid in process.read_text().split():
+            try:
+                words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+            except FileNotFoundError:
+                continue
+            found.update({Path(word).name: int(pid) for word in words if Path(word).name in NODES})
+    return found
+
+
+@pytest.fixture(scope="module")
+def twin_runs(tmp_path_factory):
+    """The same case twice on the same nodes, and its bags."""
+    out = tmp_path_factory.mktemp("twins")
+    with Progress(disable=True) as progress:
+        cases = [closed_loop("first"), closed_loop("second")]
+        return list(run_cases(cases, out, "twins", progress))
+
+
+def serialized(bag: Path, name: str) -> list[tuple[int, bytes]]:
+    with AnyReader([bag]) as reader:
+        return [(t, d) for c, t, d in reader.messages() if c.topic.endswith(f"/{name}")]
+
+
+def test_two_runs_of_one_seed_are_byte_equal(twin_runs):
+    first, second = (run.bag for run in twin_runs)
+    for topic in (*LOOP, "temperature"):
+        samples = serialized(first, topic)
+        assert samples == serialized(second, topic)
+    assert len(samples) >= 60  # the temperature's grid is 1 ms, the run lasts 60 ms
+
+
+def test_bag_has_every_sample_once_for_another_mcap_reader(twin_runs):
+    bag = twin_runs[0].bag
+    numbers: dict[str, list[int]] = {topic: [] for topic in LOOP}
+    with (bag / f"{bag.name}.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        for schema, channel, message in reader.iter_messages():
+            topic = channel.topic.split("/")[-1]
+            if topic in LOOP:
+                # CDR: 4 bytes of encapsulation, stamp, empty frame_id (length 1 and NUL), padding to 8.
+                numbers[topic].append(int.from_bytes(message.data[20:28], "little"))
+                assert schema.name == "piezo_gripper_msgs/msg/Sample"
+                assert b"uint64 number" in schema.data
+    for topic in LOOP:
+        assert numbers[topic] == list(range(SAMPLES)), topic
+
+
+def test_nodes_over_topics_give_the_samples_of_the_engine(twin_runs):
+    run = twin_runs[0]
+    parameters = run.case.parameters()
+    expected = engine.run(
+        parameters["cantilever"],
+        parameters["feedforward"],
+        parameters["feedback"],
+        parameters["temperature"],
+        run.case.reference,
+        SAMPLES,
+        run.case.tip_force,
+    )
+    got = read(run.bag)
+    np.testing.assert_allclose(got.time, expected.time, rtol=0, atol=1e-9)
+    for signal_name in ("reference", "deflection", "command", "voltage", "temperature"):
+        np.testing.assert_allclose(
+            getattr(got, signal_name), getattr(expected, signal_name), rtol=0, atol=1e-12,
+            err_msg=signal_name,
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("victim", list(NODES))
+def test_killed_node_ends_the_experiment_by_name(victim, tmp_path):
+    endless = closed_loop("endless", samples=10**6)
+    with Progress(disable=True) as progress:
+
+        def kill_when_running():
+            deadline = time.monotonic() + 30
+            while time.monotonic() < deadline:
+                if progress.tasks and progress.tasks[0].completed > 50:
+                    os.kill(children()[victim], signal.SIGKILL)
+                    return
+                time.sleep(0.01)
+
+        killer = threading.Thread(target=kill_when_running)
+        killer.start()
+        with pytest.raises(NodeDied, match=f"'{victim}' was killed by SIGKILL"):
+            list(run_cases([endless], tmp_path, "victims", progress))
+        killer.join()
+    assert children() == {}
+
+
+TWO_FINGERS = """
+import sys
+from pathlib import Path
+from rich.progress import Progress
+from test_loop import closed_loop
+from piezo_sim.experiment.runner import run_cases
+with Progress(disable=True) as progress:
+    list(run_cases([closed_loop("run", 300)], Path(sys.argv[2]), sys.argv[1], progress))
+"""
+
+
+def test_two_fingers_live_side_by_side(tmp_path, twin_runs):
+    folder = Path(__file__).parent
+    fingers = {
+        side: subprocess.Popen([sys.executable, "-c", TWO_FINGERS, side, tmp_path / side], cwd=folder)
+        for side in ("left", "right")
+    }
+    assert {side: finger.wait(60) for side, finger in fingers.items()} == {"left": 0, "right": 0}
+    alone = read(twin_runs[0].bag).deflection[:300]
+    for side in fingers:
+        recording = read(tmp_path / side / "bags" / "run", side)
+        np.testing.assert_array_equal(recording.deflection, alone)
+
+
+def test_refused_parameters_are_named(tmp_path):
+    bad = replace(closed_loop("bad"), temperature={"base_degc": 500.0})
+    with pytest.raises(ValueError, match=r"case 'bad': temperature: 'base_degc' is 500.0, .*150"):
+        bad.parameters()
