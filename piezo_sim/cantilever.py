@@ -8,10 +8,10 @@ Voltage, temperature and tip force are held from t_k to t_{k+1}. The finger star
 equilibrium with the first temperature, and deflections count from there, as after pressing the sensor's
 zero key. So a run at constant 32 °C starts at zero (Fig. 13), and g(T) is what changes from then on.
 
-Two figures of the paper disagree: 40 V end at about 30 µm in Fig. 3 and 4, at 22 µm in Fig. 5. On the
+Figures of the paper disagree: 40 V from rest end at about 30 µm in Fig. 4, at 22 µm in Fig. 5. On the
 first rise from rest a Prandtl-Ishlinskii actuator reaches just the tip of its loop, so no weights give
-both. A sensor zeroed at 0 V behind a negative excursion explains 26 of the 30 µm (the remanence is
-4 µm). The default follows Fig. 5; the shape over time is that of Fig. 3 and 4.
+both; a sensor zeroed at 0 V behind a negative excursion explains 26 of the 30 µm (the remanence is
+4 µm). The default follows Fig. 5 in size, and Fig. 3 and 4 in their course over time.
 """
 
 from __future__ import annotations

@@ -8,19 +8,20 @@ is part of the equation of motion,
     a2 x'' + (a1 + s_p damping) x' + (1 + s_p stiffness) x
         = H_s(U) + s_p F_external - s_p stiffness (b - free_play),
 
-stepped as exactly as the free tip. Only a sample in which the tip touches or leaves is split, into
-SPLIT parts that are each in or out of contact.
+stepped as exactly as the free tip. With an object in front, every sample is split into parts that are
+each in or out of contact, PART radians of the vibration in contact at most.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from piezo_control.parameters import parameter
 from piezo_sim.dynamics import DynamicsParameters, Propagator, move, propagator
 
-SPLIT = 32
+PART = 0.05
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class ContactParameters:
     """Object in front of the tip, on the side of positive deflection; stiffness 0: none."""
 
     stiffness: float = parameter(
-        0.0, "stiffness of the object; 0: nothing to touch", unit="N/m", low=0.0, high=1e6
+        0.0, "stiffness of the object; 0: nothing to touch", unit="N/m", low=0.0, high=1e5
     )
     damping: float = parameter(
         0.0, "damping of the object in contact", unit="N s/m", low=0.0, high=1e3
@@ -39,12 +40,11 @@ class ContactParameters:
 
 
 class Tip(NamedTuple):
-    """Motion of the tip, free and in contact, over a whole sample and over one part of it."""
+    """Motion of the tip over one of `parts` parts of a sample, free and in contact."""
 
+    parts: int
     free: Propagator
     touching: Propagator
-    free_part: Propagator
-    touching_part: Propagator
     stiffness: float
     damping: float
     free_play: float
@@ -55,12 +55,15 @@ def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_
     """Return the tip's exact motion for one sample time (s)."""
     inertia, damping, stiffness = dynamics.denominator
     softness = dynamics.elastic_constant
-    touching = (damping + softness * contact.damping, stiffness + softness * contact.stiffness)
+    total_damping = damping + softness * contact.damping
+    total_stiffness = stiffness + softness * contact.stiffness
+    parts = 1
+    if contact.stiffness > 0.0:
+        parts = math.ceil(sample_time * math.sqrt(total_stiffness / inertia) / PART)
     return Tip(
-        propagator(inertia, damping, stiffness, sample_time),
-        propagator(inertia, *touching, sample_time),
-        propagator(inertia, damping, stiffness, sample_time / SPLIT),
-        propagator(inertia, *touching, sample_time / SPLIT),
+        parts,
+        propagator(inertia, damping, stiffness, sample_time / parts),
+        propagator(inertia, total_damping, total_stiffness, sample_time / parts),
         contact.stiffness,
         contact.damping,
         contact.free_play,
@@ -80,23 +83,10 @@ def move_tip(motion, tip: Tip, target: float, offset: float) -> None:
 
     `target` is H_s(U) + s_p F_external, `offset` is b = g(T) + Creep, both held within the sample (m).
     """
-    if tip.stiffness == 0.0:
-        move(motion, tip.free, target)
-        return
     compliance = tip.elastic_constant * tip.stiffness
     held = (target - compliance * (offset - tip.free_play)) / (1.0 + compliance)
-    x = motion[0]
-    v = motion[1]
-    touching = contact_force(tip, x + offset, v) < 0.0
-    if touching:
-        move(motion, tip.touching, held)
-    else:
-        move(motion, tip.free, target)
-    if (contact_force(tip, motion[0] + offset, motion[1]) < 0.0) != touching:
-        motion[0] = x
-        motion[1] = v
-        for _ in range(SPLIT):
-            if contact_force(tip, motion[0] + offset, motion[1]) < 0.0:
-                move(motion, tip.touching_part, held)
-            else:
-                move(motion, tip.free_part, target)
+    for _ in range(tip.parts):
+        if contact_force(tip, motion[0] + offset, motion[1]) < 0.0:
+            move(motion, tip.touching, held)
+        else:
+            move(motion, tip.free, target)

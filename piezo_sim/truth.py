@@ -24,10 +24,10 @@ class TruthParameters:
     """Bouc-Wen coefficients; the defaults give ±22 µm at ±40 V and a loop width of 17 %."""
 
     slope: float = parameter(
-        6.85e-7, "deflection per volt without hysteresis", unit="m/V", low=1e-12, high=1e-3
+        7.1e-7, "deflection per volt without hysteresis", unit="m/V", low=1e-12, high=1e-3
     )
     alpha: float = parameter(
-        2.4e-7, "growth of the lag with the voltage", unit="m/V", low=0.0, high=1e-3
+        2.3e-7, "growth of the lag with the voltage", unit="m/V", low=1e-15, high=1e-3
     )
     beta: float = parameter(0.04, "decay of the lag", unit="1/V", low=0.0, high=1e3)
     gamma: float = parameter(
@@ -44,7 +44,7 @@ class TruthParameters:
         1e4, "time up to which creep is logarithmic", unit="s", low=1e-5, high=1e9
     )
     creep_per_decade: float = parameter(
-        0.015, "creep per decade of time, relative to the deflection", low=0.0, high=1.0
+        0.01, "creep per decade of time, relative to the deflection", low=0.0, high=1.0
     )
     creep_per_decade_degc: float = parameter(
         0.005, "increase of the creep per decade, per degree", unit="1/degC", low=0.0, high=1.0

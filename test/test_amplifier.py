@@ -1,0 +1,35 @@
+"""Amplifier: clip, slew rate, bandwidth, each against its definition."""
+
+import math
+
+import pytest
+
+from piezo_sim.amplifier import AmplifierParameters, amplify, discretize
+
+
+def respond(parameters, demands, sample_time=1e-4):
+    output = [0.0, 0.0]
+    amplifier = discretize(parameters, sample_time)
+    return [amplify(output, amplifier, demand) for demand in demands], int(output[1])
+
+
+def test_within_the_limits_the_ideal_amplifier_changes_nothing():
+    demands = [1.0, -39.999, 40.0, 1.0 / 3.0, -40.0]
+    assert respond(AmplifierParameters(), demands) == (demands, 0)
+
+
+def test_beyond_the_limits_it_clips_and_counts():
+    applied, clipped = respond(AmplifierParameters(), [50.0, -41.0, 3.0])
+    assert applied == [40.0, -40.0, 3.0]
+    assert clipped == 2
+
+
+def test_slew_rate_limits_the_change_per_sample():
+    applied, clipped = respond(AmplifierParameters(slew_rate=1e5), [25.0] * 4 + [-25.0] * 2)
+    assert applied == pytest.approx([10.0, 20.0, 25.0, 25.0, 15.0, 5.0])
+    assert clipped == 0
+
+
+def test_bandwidth_is_a_first_order_lag():
+    applied, _ = respond(AmplifierParameters(bandwidth_hz=1000.0), [10.0] * 10)
+    assert applied[9] == pytest.approx(10.0 * (1.0 - math.exp(-2.0 * math.pi)), rel=1e-12)

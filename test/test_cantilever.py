@@ -1,0 +1,169 @@
+"""The composed plant: against an independent integration, and against the paper's figures."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from piezo_control.hysteresis import Hysteresis
+from piezo_control.parameters import build, load
+from piezo_sim.cantilever import Cantilever, CantileverParameters
+from piezo_sim.contact import ContactParameters
+from piezo_sim.creep import CreepParameters
+from piezo_sim.dynamics import DynamicsParameters
+from piezo_sim.sensor import SensorParameters
+from piezo_sim.thermal import ThermalParameters
+
+PERFECT = SensorParameters(resolution=0.0, noise=0.0, delay_samples=0)
+
+
+def run(cantilever, voltages, temperatures, forces=None):
+    """Return readings y_0 ... y_n of n inputs."""
+    forces = np.zeros(len(voltages)) if forces is None else forces
+    readings = [cantilever.measure()]
+    for inputs in zip(voltages, np.broadcast_to(temperatures, len(voltages)), forces):
+        cantilever.advance(*map(float, inputs))
+        readings.append(cantilever.measure())
+    return np.array(readings)
+
+
+def test_equation_3_against_an_integration():
+    """delta = H_s(U) D(s) + s_p F D(s) + g(T) + Creep(U, T) with every term at work."""
+    thermal = ThermalParameters(gain_per_degc=0.0, lag_per_degc=0.0)
+    parameters = CantileverParameters(sensor=PERFECT, thermal=thermal)
+    voltages, temperatures, forces = [30.0, -20.0, 10.0], [22.0, 40.0, 30.0], [0.0, 1e-3, -2e-3]
+    hold = 200  # samples, 20 ms each
+    got = run(
+        Cantilever(parameters),
+        np.repeat(voltages, hold),
+        np.repeat(temperatures, hold),
+        np.repeat(forces, hold),
+    )
+    a2, a1, _ = DynamicsParameters().denominator
+    creep = CreepParameters()
+    static = Hysteresis(parameters.hysteresis)
+    state = np.array([0.0, 0.0, 22.0, 0.0, 0.0, 0.0])
+    expected = [0.0]
+    for voltage, temperature, force in zip(voltages, temperatures, forces):
+        target = static.step(voltage) + DynamicsParameters().elastic_constant * force
+
+        def law(_, s, voltage=voltage, temperature=temperature, target=target):
+            gain = creep.gain + creep.gain_per_degc * (s[2] - 22.0)
+            pull = np.array(creep.shares) * gain * voltage - s[3:]
+            body = (temperature - s[2]) / thermal.time_constant
+            spring = (target - a1 * s[1] - s[0]) / a2
+            return np.concatenate([[s[1], spring, body], pull / creep.times])
+
+        path = solve_ivp(
+            law, (0.0, 0.02), state, t_eval=np.arange(1, hold + 1) * 1e-4, method="DOP853",
+            rtol=1e-11, atol=[1e-15, 1e-12, 1e-9, 1e-16, 1e-16, 1e-16],
+        )  # fmt: skip
+        state = path.y[:, -1]
+        expected += (
+            path.y[0] + thermal.sensitivity * (path.y[2] - 22.0) + path.y[3:].sum(axis=0)
+        ).tolist()
+    # All is exact but the creep's gain, which follows the body half a sample late:
+    # h / 2 * warming * gain_per_degc * U * sum(shares / times) = 5e-5 * 1.2 * 1.2e-8 * 20 * 0.125 m.
+    np.testing.assert_allclose(got, expected, rtol=0.0, atol=3e-12)
+
+
+def test_first_reading_is_zero_and_rest_stays_at_rest_at_any_temperature():
+    for temperature in (22.0, 32.0):
+        cantilever = Cantilever(CantileverParameters(sensor=PERFECT))
+        assert np.max(np.abs(run(cantilever, np.zeros(1000), temperature))) == 0.0
+
+
+def test_warming_by_10_degrees_moves_the_free_tip_by_g():
+    cantilever = Cantilever(CantileverParameters(sensor=PERFECT))
+    temperatures = np.concatenate([np.full(10, 22.0), np.full(30000, 32.0)])
+    readings = run(cantilever, np.zeros(30010), temperatures)
+    assert readings[-1] == pytest.approx(10 * ThermalParameters().sensitivity, rel=1e-4)
+    assert readings[10 + 3000] == pytest.approx(1.5e-6 * (1 - np.exp(-1)), rel=1e-3)  # 0.3 s
+
+
+@pytest.mark.parametrize("plant", ["prandtl_ishlinskii", "truth"])
+@pytest.mark.parametrize("temperature", [22.0, 32.0])
+def test_figure_5_loop(plant, temperature):
+    """1 Hz, ±40 V: about ±22 µm; the loop hardly moves with temperature."""
+    parameters = CantileverParameters(plant=plant, sample_time=1e-3, sensor=PERFECT)
+    voltage = 40.0 * np.sin(2.0 * np.pi * np.arange(1, 3001) * 1e-3)
+    loop = run(Cantilever(parameters), voltage, temperature)[2001:]
+    assert np.max(loop) == pytest.approx(22e-6, rel=0.08)
+    assert np.min(loop) == pytest.approx(-22e-6, rel=0.08)
+    width = (loop[499] - loop[999]) / np.ptp(loop)
+    assert 0.15 <= width <= (0.20 if temperature == 22.0 else 0.22)
+
+
+@pytest.mark.parametrize("plant", ["prandtl_ishlinskii", "truth"])
+def test_figure_4_creep_is_negligible_at_22_and_large_at_32_degrees(plant):
+    """40 V for 300 s; negligible: within the thickness of a line in the figure, 5 % of the step."""
+    parameters = CantileverParameters(plant=plant, sample_time=0.1, sensor=PERFECT)
+    drift = {}
+    for temperature in (22.0, 32.0):
+        readings = run(Cantilever(parameters), np.full(3000, 40.0), temperature)
+        drift[temperature] = readings[-1] - readings[1]
+    assert 0.0 < drift[22.0] < 0.05 * 22e-6
+    assert 3e-6 < drift[32.0] < 8e-6
+
+
+@pytest.mark.parametrize("temperature, slope", [(22.0, (0.99, 1.01)), (32.0, (1.03, 1.07))])
+def test_figure_9_slope_of_the_compensated_actuator(temperature, slope):
+    """The fixed inverse gives slope 1 at 22 °C and a visibly different one at 32 °C."""
+    parameters = CantileverParameters(sample_time=1e-3, sensor=PERFECT)
+    inverse = Hysteresis(parameters.hysteresis).inverse()
+    reference = 20e-6 * np.sin(2.0 * np.pi * np.arange(1, 3001) * 1e-3)
+    readings = run(Cantilever(parameters), inverse(reference), temperature)[1:]
+    assert slope[0] <= np.polyfit(reference[2000:], readings[2000:], 1)[0] <= slope[1]
+
+
+def test_contact_force_joins_the_external_force():
+    contact = ContactParameters(stiffness=1000.0, damping=0.1, free_play=5e-6)
+    cantilever = Cantilever(CantileverParameters(contact=contact, sensor=PERFECT))
+    run(cantilever, np.full(5000, 40.0), 22.0, np.full(5000, 1e-3))
+    expected = 1e-3 - 1000.0 * (cantilever.deflection - 5e-6)
+    assert cantilever.tip_force == pytest.approx(expected, rel=1e-6)
+    assert 5e-6 < cantilever.deflection < 22e-6
+
+
+@pytest.mark.parametrize("name, unit", [("voltage", "V"), ("temperature_degc", "°C")])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_not_finite_is_refused_and_changes_nothing(name, unit, value):
+    cantilever = Cantilever(CantileverParameters())
+    cantilever.advance(10.0, 22.0)
+    before = cantilever.snapshot()
+    inputs = {"voltage": 1.0, "temperature_degc": 22.0, name: value}
+    with pytest.raises(ValueError, match=f"{name} is {value} {unit} at sample 1"):
+        cantilever.advance(**inputs)
+    assert cantilever.snapshot() == before
+
+
+NOISY = CantileverParameters(sensor=SensorParameters(dropout_rate=0.1, delay_samples=3))
+
+
+def test_snapshot_and_restore_continue_alike():
+    voltages = 60.0 * np.sin(np.arange(6000) * 0.01)
+    cantilever = Cantilever(NOISY)
+    run(cantilever, voltages[:5000], 25.0)  # beyond one block of random draws
+    snapshot = cantilever.snapshot()
+    expected = run(cantilever, voltages[5000:], 30.0), cantilever.clipped
+    other = Cantilever(NOISY)
+    for _ in range(2):
+        other.restore(snapshot)
+        assert (run(other, voltages[5000:], 30.0) == expected[0]).all()
+        assert other.clipped == expected[1] > 0
+
+
+def test_reset_repeats_a_run_and_another_seed_does_not():
+    voltages = 30.0 * np.sin(np.arange(500) * 0.05)
+    cantilever = Cantilever(NOISY)
+    first = run(cantilever, voltages, 22.0)
+    cantilever.reset()
+    assert (run(cantilever, voltages, 22.0) == first).all()
+    other = Cantilever(dataclasses.replace(NOISY, seed=2))
+    assert (run(other, voltages, 22.0) != first).any()
+
+
+def test_parameter_file_holds_the_defaults():
+    values = load("params/cantilever.yaml", "cantilever")
+    assert build(CantileverParameters, values) == CantileverParameters()
