@@ -1,6 +1,7 @@
 """The composed plant: against an independent integration, and against the paper's figures."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from piezo_sim.dynamics import DynamicsParameters
 from piezo_sim.sensor import SensorParameters
 from piezo_sim.thermal import ThermalParameters
 
+PARAMS = Path(__file__).parent.parent / "params"
 PERFECT = SensorParameters(resolution=0.0, noise=0.0, delay_samples=0)
 
 
@@ -165,5 +167,5 @@ def test_reset_repeats_a_run_and_another_seed_does_not():
 
 
 def test_parameter_file_holds_the_defaults():
-    values = load("params/cantilever.yaml", "cantilever")
+    values = load(PARAMS / "cantilever.yaml", "cantilever")
     assert build(CantileverParameters, values) == CantileverParameters()

@@ -1,0 +1,285 @@
+"""The loop in one process: the step functions of the nodes, one after the other, without ROS.
+
+Per sample k, as over topics: the sensor reads, feedback turns reference and reading into a command,
+feedforward the command into a voltage, and the cantilever goes on with voltage, temperature and tip
+force held. For equal parameters and seed the samples are those of the nodes.
+
+With numba the loop is compiled to machine code and kept on disk; without it the same functions run
+as Python, slowly.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from piezo_control import feedback as feedback_law
+from piezo_control import feedforward as feedforward_law
+from piezo_control import hysteresis
+from piezo_control.feedback import (
+    FeedbackCoefficients,
+    FeedbackParameters,
+    FeedbackState,
+    feedback_step,
+)
+from piezo_control.feedforward import (
+    FeedforwardCoefficients,
+    FeedforwardParameters,
+    FeedforwardState,
+    feedforward_step,
+)
+from piezo_control.parameters import ParameterError
+from piezo_control.profile import Profile
+from piezo_sim import amplifier, cantilever, contact, creep, dynamics, sensor, thermal, truth
+from piezo_sim.cantilever import (
+    CantileverModel,
+    CantileverParameters,
+    CantileverState,
+    advance,
+    deflection_of,
+    look,
+)
+from piezo_sim.temperature import TemperatureParameters, grid_index, temperature
+
+AT_ONCE = 1 << 16
+"""Samples whose random draws are made together; the signals do not depend on it."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Signals of one run, 1-D arrays with shape (nsamples,) in SI units and °C.
+
+    `deflection` is what the sensor said, `true_deflection` where the tip was; `voltage` is the
+    demand on the amplifier, `tip_force` the sum of external and contact force. `clipped` counts the
+    samples at which feedforward or amplifier limited the voltage.
+    """
+
+    time: np.ndarray
+    reference: np.ndarray
+    deflection: np.ndarray
+    command: np.ndarray
+    voltage: np.ndarray
+    temperature: np.ndarray
+    tip_force: np.ndarray
+    true_deflection: np.ndarray
+    clipped: int
+
+
+class Inputs(NamedTuple):
+    """What comes in from outside, per sample."""
+
+    reference: np.ndarray
+    temperature: np.ndarray
+    tip_force: np.ndarray
+    normal: np.ndarray
+    uniform: np.ndarray
+
+
+class Outputs(NamedTuple):
+    """What is taken down of every `every`-th sample."""
+
+    deflection: np.ndarray
+    command: np.ndarray
+    voltage: np.ndarray
+    tip_force: np.ndarray
+    true_deflection: np.ndarray
+
+
+class Finger(NamedTuple):
+    """Coefficients and states of all the laws of one finger."""
+
+    feedback: FeedbackCoefficients
+    feedback_state: FeedbackState
+    feedforward: FeedforwardCoefficients
+    feedforward_state: FeedforwardState
+    plant: CantileverModel
+    plant_state: CantileverState
+
+
+def run(
+    plant: CantileverParameters,
+    feedforward: FeedforwardParameters,
+    feedback: FeedbackParameters,
+    temperatures: TemperatureParameters,
+    reference: Profile,
+    samples: int,
+    tip_force: Profile | None = None,
+    every: int = 1,
+    compiled: bool | None = None,
+) -> Recording:
+    """Run one finger for `samples` samples and return every `every`-th of them.
+
+    Parameters
+    ----------
+    plant, feedforward, feedback, temperatures : parameter dataclasses
+        ``controller: none`` in `feedback` opens the loop.
+    reference, tip_force : Profile
+        In m and N; no tip force means none from outside.
+    compiled : bool, optional
+        Compile with numba; by default if numba is installed.
+
+    Raises ParameterError when the sample times of plant and controller differ, ValueError when
+    `samples` or `every` is below 1.
+    """
+    h = plant.sample_time
+    if samples < 1 or every < 1:
+        raise ValueError(f"samples is {samples}, every is {every}: both must be 1 or more")
+    if feedback.controller != "none" and feedback.sample_time != h:
+        raise ParameterError(
+            f"feedback 'sample_time' is {feedback.sample_time} s, must be the cantilever's: {h} s"
+        )
+    time = np.arange(samples) * h
+    references = reference.at(time)
+    forces = np.zeros(samples) if tip_force is None else tip_force.at(time)
+    index = grid_index(np.arange(samples), h, temperatures.period)
+    degc = temperature(temperatures, 0, int(index[-1]) + 1)[index]
+    finger = finger_at_rest(plant, feedforward, feedback, float(degc[0]))
+    outputs = Outputs(*np.empty((len(Outputs._fields), -(-samples // every))))
+    loop = compiled_loop() if compiled or compiled is None and has_numba() else run_samples
+    noise, dropouts = cantilever.generators(plant.seed)
+    for first in range(0, samples, AT_ONCE):
+        last = min(first + AT_ONCE, samples)
+        inputs = Inputs(
+            references[first:last],
+            degc[first:last],
+            forces[first:last],
+            noise.standard_normal(last - first),
+            dropouts.random(last - first),
+        )
+        loop(finger, inputs, first, every, outputs)
+    amplifier_clips = finger.plant_state.amplifier[1]
+    return Recording(
+        time[::every],
+        references[::every],
+        outputs.deflection,
+        outputs.command,
+        outputs.voltage,
+        degc[::every],
+        outputs.tip_force,
+        outputs.true_deflection,
+        int(finger.feedforward_state.clipped[0] + amplifier_clips),
+    )
+
+
+def drive(
+    plant: CantileverParameters,
+    temperatures: TemperatureParameters,
+    voltage: Profile,
+    samples: int,
+    tip_force: Profile | None = None,
+    every: int = 1,
+) -> Recording:
+    """Apply a `voltage` profile (V) to the bare cantilever; reference and command are that voltage."""
+    limit = plant.amplifier.voltage_limit
+    straight = FeedforwardParameters(
+        compensator="static_gain", static_gain=1.0, voltage_limit=limit, slew_limit=np.inf
+    )
+    open_loop = FeedbackParameters(command_low=-limit, command_high=limit)
+    return run(plant, straight, open_loop, temperatures, voltage, samples, tip_force, every)
+
+
+def finger_at_rest(
+    plant: CantileverParameters,
+    feedforward: FeedforwardParameters,
+    feedback: FeedbackParameters,
+    temperature_degc: float,
+) -> Finger:
+    """Return coefficients and initial states of a finger, as float64 arrays."""
+    law = feedforward_law.Feedforward(feedforward, plant.sample_time)
+    order = feedback.order
+    return _arrays(
+        Finger(
+            feedback_law.feedback_coefficients(feedback),
+            FeedbackState([0.0] * order, [0.0] * order),
+            law.coefficients,
+            law.state,
+            cantilever.model(plant),
+            cantilever.rest(plant, temperature_degc),
+        )
+    )
+
+
+def copy_finger(finger: Finger) -> Finger:
+    """Return a copy that shares no array with `finger`."""
+    return copy.deepcopy(finger)
+
+
+def _arrays(tree: Any) -> Any:
+    """Return nested named tuples with every list turned into a float64 array."""
+    if isinstance(tree, tuple):
+        return type(tree)(*map(_arrays, tree))
+    return np.array(tree, dtype=float) if isinstance(tree, list) else tree
+
+
+def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs: Outputs) -> None:
+    """Run the samples of `inputs`, the first one being number `first`."""
+    plant = finger.plant
+    state = finger.plant_state
+    for n in range(len(inputs.reference)):
+        look(plant, state, inputs.normal[n], inputs.uniform[n])
+        deflection = state.sensor[0]
+        command = feedback_step(
+            finger.feedback, finger.feedback_state, inputs.reference[n], deflection
+        )
+        voltage = feedforward_step(finger.feedforward, finger.feedforward_state, command)
+        if (first + n) % every == 0:
+            row = (first + n) // every
+            outputs.deflection[row] = deflection
+            outputs.command[row] = command
+            outputs.voltage[row] = voltage
+            outputs.tip_force[row] = state.tip_force[0]
+            outputs.true_deflection[row] = deflection_of(plant, state)
+        advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
+
+
+def has_numba() -> bool:
+    """Say whether the compiler is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+@functools.cache
+def compiled_loop() -> Any:
+    """Return `run_samples` compiled by numba; the machine code is kept for the next process.
+
+    numba notices a change of this file, not of the laws it calls, so the code is kept in a folder
+    named after the sources of all of them.
+    """
+    import numba
+    from numba.extending import register_jitable
+
+    laws = (
+        hysteresis, feedforward_law, feedback_law, amplifier, cantilever, contact, creep, dynamics,
+        sensor, thermal, truth,
+    )  # fmt: skip
+    for law in laws:
+        for kernel in vars(law).values():
+            if inspect.isfunction(kernel) and kernel.__module__ == law.__name__:
+                register_jitable(forceinline=True)(kernel)
+    sources = hashlib.sha256()
+    for law in laws:
+        sources.update(Path(law.__file__).read_bytes())
+    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "piezo_gripper")
+    folder /= sources.hexdigest()[:16]
+    # Without reference counts (_nrt) an allocation in the loop would not even compile.
+    options = {"nogil": True, "error_model": "numpy", "_nrt": False}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        warnings.warn(f"compiled anew in every process: no room at {folder}: {error}", stacklevel=2)
+        return numba.njit(**options)(run_samples)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(folder)
+    try:
+        return numba.njit(cache=True, **options)(run_samples)
+    finally:
+        numba.config.CACHE_DIR = before
