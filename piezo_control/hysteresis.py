@@ -30,6 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -141,14 +142,27 @@ def coefficients(parameters: HysteresisParameters, sample_time: float) -> Coeffi
 
 
 def invert(operator: Coefficients) -> Coefficients:
-    """Return the coefficients of the analytic inverse (thresholds r'_i in m, weights w'_i in V/m)."""
-    thresholds, weights = _invert_side(
-        operator.weights[0], operator.thresholds[1:], operator.weights[1:]
-    )
+    """Return the coefficients of the analytic inverse (thresholds r'_i in m, weights w'_i in V/m).
+
+    Raises
+    ------
+    ParameterError
+        If the thresholds depend so much on the rate that errors would grow from sample to sample:
+        each volt of the last step moves the next voltage by up to b/T abs(1 - w_0/W_i), T being the
+        sample time, which must stay below 1.
+    """
+    first = operator.weights[0]
+    feedback = max(abs(1.0 - first / slope) for slope in accumulate(operator.weights))
+    if not operator.dilation * feedback < 1.0:
+        raise ParameterError(
+            f"'rate_coefficient' is {operator.dilation:g} sample times, must be below "
+            f"{1.0 / feedback:g}: the inverse would be unstable"
+        )
+    thresholds, weights = _invert_side(first, operator.thresholds[1:], operator.weights[1:])
     return Coefficients(
         [0.0, *thresholds],
-        [1.0 / operator.weights[0], *weights],
-        operator.weights[0] * operator.dilation,
+        [1.0 / first, *weights],
+        first * operator.dilation,
         *_invert_side(1.0, operator.upper_thresholds, operator.upper_weights),
         *_invert_side(1.0, operator.lower_thresholds, operator.lower_weights),
     )
@@ -410,13 +424,15 @@ class HysteresisBatch:
     def step(self, value: ArrayLike) -> NDArray[np.float64]:
         """Take one voltage (V) per actuator and return the deflections (m); inverse: m to V."""
         value = np.asarray(value, float)
-        drive = self._dead_zones(value) if self._inverse else value
+        drive = _dead_zones_of(self._c, value) if self._inverse else value
         growth = (self._c.dilation * self._voltage_step)[:, None] * self._growing
         threshold = self._c.thresholds + growth
         drive = drive[:, None]
         self.plays = np.minimum(drive + threshold, np.maximum(drive - threshold, self.plays))
         total = np.sum(self._c.weights * self.plays, axis=1)
-        result, voltage = (total, total) if self._inverse else (self._dead_zones(total), value)
+        result, voltage = (
+            (total, total) if self._inverse else (_dead_zones_of(self._c, total), value)
+        )
         self._voltage_step = np.abs(voltage - self._voltage)
         self._voltage = voltage
         return result
@@ -425,14 +441,13 @@ class HysteresisBatch:
         """Apply a history, shape (samples, actuators); return one of equal shape."""
         return np.array([self.step(value) for value in np.asarray(values, float)])
 
-    def _dead_zones(self, value: NDArray) -> NDArray:
-        above = np.maximum(value[:, None] - self._c.upper_thresholds, 0.0)
-        below = np.minimum(value[:, None] + self._c.lower_thresholds, 0.0)
-        return (
-            value
-            + np.sum(self._c.upper_weights * above, axis=1)
-            + np.sum(self._c.lower_weights * below, axis=1)
-        )
+
+def _dead_zones_of(c: Coefficients, value: NDArray) -> NDArray:
+    """Array form of :func:`dead_zones`, of a 1-D `value`."""
+    above = np.maximum(value[:, None] - c.upper_thresholds, 0.0)
+    below = np.minimum(value[:, None] + c.lower_thresholds, 0.0)
+    bent = np.sum(c.upper_weights * above, axis=1) + np.sum(c.lower_weights * below, axis=1)
+    return value + bent
 
 
 def play_history(
@@ -460,3 +475,21 @@ def play_history(
         np.minimum(history[sample], upper[sample], out=history[sample])
         state = history[sample]
     return history
+
+
+def deflection_history(
+    parameters: HysteresisParameters, voltage: ArrayLike, sample_time: float = 1.0
+) -> NDArray[np.float64]:
+    """Return the deflections (m) of a homed actuator under a long voltage history (V, 1-D).
+
+    The same as ``Hysteresis(parameters, sample_time)(voltage)``, computed play by play at once.
+    """
+    c = coefficients(parameters, sample_time)
+    c = Coefficients(*(np.array(entry) for entry in c))
+    voltage = np.asarray(voltage, float)
+    thresholds = c.thresholds
+    if c.dilation:
+        voltage_step = np.abs(np.diff(voltage, prepend=0.0))
+        growth = c.dilation * np.concatenate(([0.0], voltage_step[:-1]))
+        thresholds = thresholds + growth[:, None] * (np.arange(len(thresholds)) > 0)
+    return _dead_zones_of(c, play_history(thresholds, voltage) @ c.weights)

@@ -12,6 +12,7 @@ from piezo_control.hysteresis import (
     HysteresisBatch,
     HysteresisParameters,
     coefficients,
+    deflection_history,
     invert,
     play_history,
     reachable_range,
@@ -35,21 +36,27 @@ def dead_zones(draw):
 
 
 no_dead_zones, no_rate = st.just(((), ())), st.just(0.0)
+SAMPLE_TIME = 0.1  # s
 
 
 @st.composite
-def hysteresis_parameters(draw, dead_zones=no_dead_zones, rate_coefficient=no_rate):
-    """Any order; slopes W_i from 0.05 to 1 um/V in any order, so that single weights are negative."""
+def hysteresis_parameters(draw, dead_zones=no_dead_zones, rate=no_rate):
+    """Any order; slopes W_i from 0.05 to 1 um/V in any order, so that single weights are negative.
+
+    `rate` is a fraction of the rate coefficient at which the inverse would become unstable.
+    """
     count = draw(st.integers(0, 15))
     gaps = draw(st.lists(st.floats(0.01, 5.0), min_size=count, max_size=count))
     slopes = draw(st.lists(st.floats(0.05e-6, 1e-6), min_size=count + 1, max_size=count + 1))
     upper, lower = draw(dead_zones), draw(dead_zones)
+    feedback = max([abs(1.0 - slopes[0] / slope) for slope in slopes])
+    largest = SAMPLE_TIME / max(feedback, 0.1)
     return HysteresisParameters(
         (0.0, *increasing(gaps)),
         (slopes[0], *np.diff(slopes).tolist()),
         *upper,
         *lower,
-        draw(rate_coefficient),
+        draw(rate) * largest,
     )
 
 
@@ -70,14 +77,14 @@ def test_operator_is_the_weighted_sum_of_plays(parameters, history):
 
 
 @given(
-    hysteresis_parameters(dead_zones(), st.floats(0.0, 0.1)),
+    hysteresis_parameters(dead_zones(), st.floats(0.0, 0.9)),
     histories,
     histories,
 )
 @settings(deadline=None, max_examples=300)
 def test_operator_after_inverse_is_the_identity(parameters, past, history):
     """Modified, rate-dependent, single negative weights, states of a random past: to 1e-12."""
-    actuator = Hysteresis(parameters, sample_time=0.1)
+    actuator = Hysteresis(parameters, sample_time=SAMPLE_TIME)
     actuator(past)
     reference = actuator.snapshot()
     deflections = actuator(history)
@@ -92,11 +99,11 @@ def test_operator_after_inverse_is_the_identity(parameters, past, history):
     )
 
 
-@given(hysteresis_parameters(dead_zones(), st.floats(0.0, 0.1)), histories, histories)
+@given(hysteresis_parameters(dead_zones(), st.floats(0.0, 0.9)), histories, histories)
 @settings(deadline=None)
 def test_inverse_follows_voltages_of_others(parameters, applied, history):
     """After voltages that were not the inverse's own, it is exact at the next sample."""
-    actuator = Hysteresis(parameters, sample_time=0.1)
+    actuator = Hysteresis(parameters, sample_time=SAMPLE_TIME)
     inverse = actuator.inverse()
     for voltage in applied:
         inverse.follow(voltage)
@@ -197,6 +204,25 @@ def test_rate_dependence_widens_the_loop_by_the_threshold():
     assert deflection[-1] == pytest.approx(1e-7 * (2 * ramp[-1] - (1.0 + 0.02 * 30.0)), rel=1e-12)
 
 
+def test_unstable_inverse_of_a_rate_dependent_operator_is_refused():
+    """Slopes 1 and 2: feedback b/T (1 - 1/2), so the bound is b = 2 T."""
+    parameters = {"thresholds": (0.0, 1.0), "weights": (1e-7, 1e-7)}
+    Hysteresis(HysteresisParameters(**parameters, rate_coefficient=0.199), 0.1).inverse()
+    actuator = Hysteresis(HysteresisParameters(**parameters, rate_coefficient=0.2), 0.1)
+    with pytest.raises(ParameterError, match="is 2 sample times, must be below 2: .* unstable"):
+        actuator.inverse()
+
+
+def test_errors_fade_in_the_inverse_of_a_rate_dependent_operator():
+    parameters = HysteresisParameters((0.0, 1.0), (1e-7, 1e-7), rate_coefficient=0.18)
+    inverse = Hysteresis(parameters, 0.1).inverse()
+    deflection = 1e-7 * np.linspace(0.0, 40.0, 400)
+    undisturbed = inverse(deflection)
+    inverse.reset()
+    deflection[10] += 1e-9
+    assert abs(inverse(deflection) - undisturbed)[-1] < 1e-9
+
+
 def test_batch_equals_single_actuators():
     rng = np.random.default_rng(3)
     parameters = [
@@ -216,6 +242,8 @@ def test_batch_equals_single_actuators():
     for finger, p in enumerate(parameters):
         single = Hysteresis(p, 0.1)(voltage[:, finger])
         np.testing.assert_allclose(deflection[:, finger], single, rtol=0, atol=1e-18)
+        at_once = deflection_history(p, voltage[:, finger], 0.1)
+        np.testing.assert_allclose(at_once, single, rtol=0, atol=1e-18)
     again = HysteresisBatch(parameters, 0.1, inverse=True)(deflection)
     np.testing.assert_allclose(again, voltage, rtol=0, atol=80e-12)
 
