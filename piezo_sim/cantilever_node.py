@@ -29,6 +29,7 @@ from piezo_control.qos import LATCHED, SAMPLE
 from piezo_control.sample_filter_node import mode, subscribers
 from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_sim.cantilever import Cantilever, CantileverParameters
+from piezo_sim.temperature import grid_index
 
 STATE_PERIOD = 0.1  # s
 JITTER_WINDOW = 10000  # periods
@@ -95,15 +96,8 @@ class CantileverNode(FingerNode):
         self.pending_voltage: float | None = None
         self.temperature = p.ambient_temperature_degc
         self.temperatures: dict[int, float] = {}
-        self.samples_per_temperature = round(p.temperature_period / p.sample_time)
-        self.samples_per_clock = round(p.clock_period / p.sample_time)
-        for name in ("temperature_period", "clock_period"):
-            ratio = getattr(p, name) / p.sample_time
-            if round(ratio) < 1 or not math.isclose(ratio, round(ratio), rel_tol=1e-9):
-                raise ValueError(
-                    f"'{name}' is {getattr(p, name):g} s, must be a multiple of "
-                    f"'sample_time' = {p.sample_time:g} s"
-                )
+        self.grid = -1
+        self.samples_per_clock = max(1, round(p.clock_period / p.sample_time))
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
         return names - {"reply_timeout", "hold_time", "ramp"}
@@ -184,11 +178,14 @@ class CantileverNode(FingerNode):
         if self.pending_voltage is None:
             return
         if self.parameters.temperature_lockstep:
-            index, phase = divmod(self.number, self.samples_per_temperature)
-            if phase == 0:
-                if index not in self.temperatures:
+            p = self.parameters
+            grid = grid_index(self.number, p.sample_time, p.temperature_period)
+            if grid != self.grid:
+                if grid not in self.temperatures:
                     return
-                self.temperature = self.temperatures.pop(index)
+                self.temperature = self.temperatures[grid]
+                self.temperatures = {n: t for n, t in self.temperatures.items() if n > grid}
+                self.grid = grid
         self.plant.advance(self.pending_voltage, self.temperature, self.tip_force[self.number])
         self.pending_voltage = None
         self.number += 1

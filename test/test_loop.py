@@ -149,7 +149,9 @@ with Progress(disable=True) as progress:
 def test_two_fingers_live_side_by_side(tmp_path, twin_runs):
     folder = Path(__file__).parent
     fingers = {
-        side: subprocess.Popen([sys.executable, "-c", TWO_FINGERS, side, tmp_path / side], cwd=folder)
+        side: subprocess.Popen(
+            [sys.executable, "-c", TWO_FINGERS, side, tmp_path / side], cwd=folder
+        )
         for side in ("left", "right")
     }
     assert {side: finger.wait(60) for side, finger in fingers.items()} == {"left": 0, "right": 0}

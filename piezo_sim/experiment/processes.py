@@ -35,12 +35,17 @@ class NodeProcesses:
         Executable name to its command-line arguments.
     log_folder : Path
         Gets one log file per node.
+
+    Attributes
+    ----------
+    running : dict of str to subprocess.Popen
+        The processes while the context is open.
     """
 
     def __init__(self, commands: Mapping[str, Sequence[str]], log_folder: Path) -> None:
         self._commands = commands
         self._log_folder = log_folder
-        self._running: dict[str, subprocess.Popen] = {}
+        self.running: dict[str, subprocess.Popen] = {}
 
     def __enter__(self) -> NodeProcesses:
         executables = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
@@ -48,7 +53,7 @@ class NodeProcesses:
         try:
             for name, arguments in self._commands.items():
                 with self._log(name).open("wb") as log:
-                    self._running[name] = subprocess.Popen(
+                    self.running[name] = subprocess.Popen(
                         [str(executables / name), *arguments],
                         stdin=subprocess.DEVNULL,
                         stdout=log,
@@ -65,11 +70,11 @@ class NodeProcesses:
         self.stop()
 
     def __len__(self) -> int:
-        return len(self._running)
+        return len(self.running)
 
     def check(self) -> None:
         """Raise NodeDied, naming node, exit code and last words, if a process has ended."""
-        for name, process in self._running.items():
+        for name, process in self.running.items():
             code = process.poll()
             if code is not None:
                 how = (
@@ -80,16 +85,16 @@ class NodeProcesses:
 
     def stop(self) -> None:
         """End every process: SIGTERM, and SIGKILL for what is still there after the grace period."""
-        for process in self._running.values():
+        for process in self.running.values():
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGTERM)
-        for process in self._running.values():
+        for process in self.running.values():
             try:
                 process.wait(GRACE)
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
-        self._running.clear()
+        self.running.clear()
 
     def _log(self, name: str) -> Path:
         return self._log_folder / f"{name}.log"

@@ -1,0 +1,332 @@
+"""Single nodes as a user meets them: the test plays the neighbours, over real topics."""
+
+import math
+import re
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import rclpy
+from ament_index_python.packages import get_package_prefix
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from mcap.reader import make_reader
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import Parameter
+
+from piezo_control.feedback import Feedback, FeedbackParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.parameters import build, load
+from piezo_control.qos import LATCHED, SAMPLE, SETPOINT
+from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
+from piezo_sim.experiment.cases import params_folder
+from piezo_sim.experiment.processes import NodeProcesses
+
+EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
+TIMEOUT = 20.0  # s, generous: the tests wait on conditions
+
+
+class Neighbour:
+    """A node of the test that publishes and listens beside the node under test."""
+
+    def __init__(self):
+        self.node = rclpy.create_node("neighbour")
+        self.executor = EventsExecutor()
+        self.executor.add_node(self.node)
+
+    def close(self):
+        self.executor.shutdown()
+        self.node.destroy_node()
+
+    def wait(self, done, timeout=TIMEOUT):
+        end = time.monotonic() + timeout
+        while not done():
+            assert time.monotonic() < end, "nothing came"
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def listen(self, kind, topic, qos=SAMPLE):
+        heard = []
+        self.node.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def publisher(self, topic, qos=SAMPLE):
+        publisher = self.node.create_publisher(Sample, topic, qos)
+        self.wait(lambda: publisher.get_subscription_count() > 0)
+        return publisher
+
+    def ask(self, kind, service, request):
+        client = self.node.create_client(kind, service)
+        self.wait(client.service_is_ready)
+        answer = client.call_async(request)
+        self.wait(answer.done)
+        return answer.result()
+
+    def set(self, node, **values):
+        request = SetParametersAtomically.Request()
+        request.parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
+        return self.ask(
+            SetParametersAtomically, f"{node}/set_parameters_atomically", request
+        ).result
+
+    def get(self, node, name):
+        (value,) = self.ask(
+            GetParameters, f"{node}/get_parameters", GetParameters.Request(names=[name])
+        ).values
+        return Parameter.from_parameter_msg(
+            rclpy.parameter.ParameterMsg(name=name, value=value)
+        ).value
+
+    def change_state(self, node, transition):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return self.ask(ChangeState, f"{node}/change_state", request).success
+
+
+@pytest.fixture
+def neighbour():
+    rclpy.init()
+    neighbour = Neighbour()
+    yield neighbour
+    neighbour.close()
+    rclpy.shutdown()
+
+
+def node(name, tmp_path, file=None, **parameters):
+    arguments = ["--ros-args"]
+    if file:
+        arguments += ["--params-file", str(params_folder() / file)]
+    for key, value in parameters.items():
+        arguments += ["-p", f"{key}:={value}"]
+    return NodeProcesses({name: arguments}, tmp_path)
+
+
+def sample(number, value):
+    return Sample(number=number, value=value)
+
+
+def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp_path):
+    law = Feedback(
+        build(FeedbackParameters, load(params_folder() / "feedback_paper.yaml", "feedback"))
+    )
+    deflections = [0.0, 1e-6, 2.5e-6]
+    expected = [law.step(10e-6, deflection) for deflection in deflections]
+    with node("feedback", tmp_path, "feedback_paper.yaml"):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        reference.publish(sample(0, 10e-6))
+        assert reference.wait_for_all_acked()
+        deflection.publish(sample(0, 0.0))
+        neighbour.wait(lambda: len(commands) == 1)
+        for _ in range(3):  # the answer got lost: asked again, nothing is computed anew
+            deflection.publish(sample(0, 0.0))
+        neighbour.wait(lambda: len(commands) == 4)
+        deflection.publish(sample(1, 1e-6))
+        neighbour.wait(lambda: len(commands) == 5)
+        deflection.publish(sample(3, 9e-6))  # sample 2 was answered by somebody else: no answer
+        deflection.publish(sample(2, math.nan))  # no answer either
+        deflection.publish(sample(2, 2.5e-6))
+        neighbour.wait(lambda: len(commands) == 6)
+        deflection.publish(sample(0, 0.0))  # a new run begins
+        neighbour.wait(lambda: len(commands) == 7)
+    assert [c.number for c in commands] == [0, 0, 0, 0, 1, 2, 0]
+    assert [c.value for c in commands] == [expected[0]] * 4 + expected[1:] + expected[:1]
+    log = (tmp_path / "feedback.log").read_text()
+    assert "'deflection' brought sample 3, expected 2" in log
+    assert "'deflection' sample 2 is nan, must be finite" in log
+
+
+def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp_path):
+    with node("feedback", tmp_path, "feedback_paper.yaml"):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        reference.publish(sample(0, 10e-6))
+        assert reference.wait_for_all_acked()
+        for number in range(50):
+            deflection.publish(sample(number, 9e-6))
+            neighbour.wait(lambda n=number: len(commands) == n + 1)
+        before = commands[-1].value
+        gain = neighbour.get("feedback", "command_high") * 0.5
+        assert neighbour.set("feedback", command_high=gain).successful
+        deflection.publish(sample(50, 9e-6))
+        neighbour.wait(lambda: len(commands) == 51)
+    # The error is constant, so a controller that continues moves by what one sample integrates.
+    step = abs(commands[49].value - commands[48].value)
+    assert abs(commands[50].value - before) <= 2 * step + 1e-12
+
+
+def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tmp_path):
+    with node("cantilever", tmp_path, "cantilever.yaml", reply_timeout=0.5):
+        deflections = neighbour.listen(Sample, "deflection")
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        neighbour.node.create_publisher(Sample, "command", SAMPLE)
+        voltage = neighbour.publisher("voltage")
+        neighbour.wait(lambda: len(deflections) >= 2)  # sample 0 is repeated until it is answered
+        assert {d.number for d in deflections} == {0}
+        for _ in range(3):
+            voltage.publish(sample(0, 10.0))
+        neighbour.wait(lambda: deflections[-1].number == 1)
+        voltage.publish(sample(0, 40.0))  # late and wrong: sample 0 is over
+        voltage.publish(sample(7, 40.0))  # not asked for
+        neighbour.wait(lambda: sum(d.number == 1 for d in deflections) >= 2)
+        voltage.publish(sample(1, 10.0))
+        neighbour.wait(lambda: deflections[-1].number == 2)
+        neighbour.wait(lambda: states[-1].phase == FingerState.FAULT)
+    repeated = [d.value for d in deflections if d.number == 1]
+    assert len(set(repeated)) == 1
+    state = states[-1]
+    assert (state.samples, state.voltage) == (2, 0.0)
+    assert state.asked_again >= 2
+    assert re.match(r"no answer to sample 2 .*'/command' or '/voltage'", state.text)
+
+
+def test_cantilever_names_the_missing_node(neighbour, tmp_path):
+    with node("cantilever", tmp_path, "cantilever.yaml"):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        neighbour.wait(lambda: states and "node 'feedback' is gone" in states[-1].text)
+        neighbour.node.create_publisher(Sample, "command", SAMPLE)
+        neighbour.wait(lambda: "node 'feedforward' is gone" in states[-1].text)
+
+
+def test_cantilever_refuses_a_voltage_that_is_no_number(neighbour, tmp_path):
+    with node("cantilever", tmp_path, "cantilever.yaml"):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        deflections = neighbour.listen(Sample, "deflection")
+        voltage = neighbour.publisher("voltage")
+        neighbour.wait(lambda: deflections)
+        voltage.publish(sample(0, 20.0))
+        neighbour.wait(lambda: deflections[-1].number == 1)
+        voltage.publish(sample(1, math.nan))
+        neighbour.wait(lambda: states[-1].phase == FingerState.FAULT)
+    assert "'voltage' sample 1 is nan V" in states[-1].text
+    assert states[-1].voltage == 0.0
+
+
+def test_feedforward_answers_with_the_law(neighbour, tmp_path):
+    law = Feedforward(FeedforwardParameters(), sample_time=1e-4)
+    commands = [0.0, 3e-6, 12e-6, 5e-6, 30e-6]
+    with node("feedforward", tmp_path, "feedforward.yaml"):
+        voltages = neighbour.listen(Sample, "voltage")
+        command = neighbour.publisher("command")
+        for number, value in enumerate(commands):
+            command.publish(sample(number, value))
+            neighbour.wait(lambda n=number: len(voltages) == n + 1)
+    assert [v.value for v in voltages] == [law.step(value) for value in commands]
+
+
+@pytest.mark.parametrize("end", ["silence", "deactivation", "SIGTERM", "SIGINT"])
+def test_feedforwardrunning_free_ramps_to_0_v(neighbour, tmp_path, end):
+    slew = 1e3  # V/s, so 20 V take 20 ms
+    parameters = {"mode": "freerunning", "ramp": slew, "hold_time": 0.2}
+    with node("feedforward", tmp_path, "feedforward.yaml", **parameters) as processes:
+        voltages = neighbour.listen(Sample, "voltage")
+        command = neighbour.publisher("command")
+        command.publish(sample(0, 8e-6))
+        neighbour.wait(lambda: voltages)
+        assert voltages[0].value > 10.0
+        if end == "deactivation":
+            assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
+        elif end != "silence":
+            processes.running["feedforward"].send_signal(signal.Signals[end])
+        neighbour.wait(lambda: voltages[-1].value == 0.0)
+    fall = [a.value - b.value for a, b in zip(voltages, voltages[1:])]
+    assert all(0 < step <= slew * 1e-3 * (1 + 1e-9) for step in fall)
+
+
+def test_cantileverrunning_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
+    parameters = {"mode": "freerunning", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
+    with node("cantilever", tmp_path, "cantilever.yaml", **parameters):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        deflections = neighbour.listen(Sample, "deflection")
+        voltage = neighbour.publisher("voltage")
+        keep_alive = neighbour.node.create_timer(0.02, lambda: voltage.publish(sample(0, 20.0)))
+        neighbour.wait(lambda: any(s.voltage == 20.0 for s in states))
+        keep_alive.cancel()
+        neighbour.wait(lambda: states[-1].voltage == 0.0 and states[-1].samples > 50)
+    stamps = [d.header.stamp.sec + d.header.stamp.nanosec * 1e-9 for d in deflections]
+    rate = (len(stamps) - 1) / (stamps[-1] - stamps[0])
+    assert rate == pytest.approx(200.0, rel=0.1)
+    assert 0.0 < states[-1].jitter < 1.0
+
+
+def test_parameters_are_described_and_refused_with_their_range(neighbour, tmp_path):
+    with node("cantilever", tmp_path, "cantilever.yaml", autostart=False):
+        request = DescribeParameters.Request(names=["sensor.resolution"])
+        (described,) = neighbour.ask(
+            DescribeParameters, "cantilever/describe_parameters", request
+        ).descriptors
+        assert "[m]" in described.description
+        before = neighbour.get("cantilever", "hysteresis.weights")
+        answer = neighbour.set("cantilever", samples=7, **{"hysteresis.weights": [1e-7, -2e-7]})
+        assert not answer.successful
+        assert "weights" in answer.reason
+        answer = neighbour.set("cantilever", plant="cardboard")
+        assert not answer.successful
+        assert "'cardboard', must be one of ['prandtl_ishlinskii', 'truth']" in answer.reason
+        answer = neighbour.set("cantilever", reply_timeout=1e9)
+        assert not answer.successful
+        assert re.search(r"3600", answer.reason) and "1000000000" in answer.reason
+        assert neighbour.get("cantilever", "hysteresis.weights") == before
+        assert neighbour.get("cantilever", "samples") == 0  # the valid half was not applied either
+
+
+def test_active_cantilever_refuses_what_needs_a_new_run(neighbour, tmp_path):
+    with node("cantilever", tmp_path, "cantilever.yaml"):
+        neighbour.publisher("voltage")
+        answer = neighbour.set("cantilever", samples=7)
+        assert (answer.successful, answer.reason) == (
+            False, "samples: deactivate 'cantilever' first",
+        )  # fmt: skip
+        assert neighbour.change_state("cantilever", Transition.TRANSITION_DEACTIVATE)
+        assert neighbour.set("cantilever", samples=7).successful
+
+
+def test_bad_start_parameter_ends_with_one_line(tmp_path):
+    result = subprocess.run(
+        [EXECUTABLES / "feedforward", "--ros-args", "-p", "voltage_limit:=-3.0"],
+        capture_output=True, text=True, timeout=TIMEOUT,
+    )  # fmt: skip
+    assert result.returncode == 2
+    assert "voltage_limit" in result.stderr and "-3.0" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "name", ["cantilever", "temperature", "feedforward", "feedback", "recorder", "experiment"]
+)
+def test_help_says_what_the_node_does(name):
+    result = subprocess.run(
+        [EXECUTABLES / name, "--help"], capture_output=True, text=True, timeout=TIMEOUT
+    )
+    assert result.returncode == 0
+    assert len(result.stdout) > 200
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as processes:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        deflection = neighbour.publisher("deflection")
+        for number in (0, 1, 1, 2, 5):  # one twice, two missing
+            deflection.publish(sample(number, number * 1e-6))
+        neighbour.wait(lambda: states and states[-1].recorded and sum(states[-1].recorded) == 4)
+        process = processes.running["recorder"]
+        process.send_signal(stop)
+        assert process.wait(TIMEOUT) == 0
+    row = states[-1].topics.index("deflection")
+    assert (states[-1].duplicates[row], states[-1].missing[row]) == (1, 2)
+    with (bag / "bag.mcap").open("rb") as stream:
+        messages = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
+    assert messages == ["/deflection"] * 4
+    assert (bag / "metadata.yaml").exists()
+
+
+def test_recorder_refuses_an_existing_folder(neighbour, tmp_path):
+    with node("recorder", tmp_path, bag=tmp_path, autostart=False):
+        assert neighbour.change_state("recorder", Transition.TRANSITION_CONFIGURE)
+        assert not neighbour.change_state("recorder", Transition.TRANSITION_ACTIVATE)
+    assert "exists; name a new folder" in (tmp_path / "recorder.log").read_text()
