@@ -16,6 +16,7 @@ fi
 . "$root/tools/underlay.bash"
 . "$root/install/local_setup.bash"
 prepend PATH "$root/install/piezo_gripper/lib/piezo_gripper"
+export FASTRTPS_DEFAULT_PROFILES_FILE="${FASTRTPS_DEFAULT_PROFILES_FILE:-$root/params/discovery.xml}"
 
 unset root
 unset -f prepend
