@@ -218,9 +218,9 @@ def test_feedforward_answers_with_the_law(neighbour, tmp_path):
 
 
 @pytest.mark.parametrize("end", ["silence", "deactivation", "SIGTERM", "SIGINT"])
-def test_feedforwardrunning_free_ramps_to_0_v(neighbour, tmp_path, end):
+def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     slew = 1e3  # V/s, so 20 V take 20 ms
-    parameters = {"mode": "freerunning", "ramp": slew, "hold_time": 0.2}
+    parameters = {"mode": "free_running", "ramp": slew, "hold_time": 0.2}
     with node("feedforward", tmp_path, "feedforward.yaml", **parameters) as processes:
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
@@ -236,8 +236,8 @@ def test_feedforwardrunning_free_ramps_to_0_v(neighbour, tmp_path, end):
     assert all(0 < step <= slew * 1e-3 * (1 + 1e-9) for step in fall)
 
 
-def test_cantileverrunning_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
-    parameters = {"mode": "freerunning", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
+def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
+    parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
     with node("cantilever", tmp_path, "cantilever.yaml", **parameters):
         states = neighbour.listen(FingerState, "state", LATCHED)
         deflections = neighbour.listen(Sample, "deflection")
