@@ -60,7 +60,7 @@ install_pins() {
   fi
   say "installing the pinned packages into .venv ($(.venv/bin/python --version), $underlay; a minute or so, see $log)"
   mkdir -p log
-  if ! .venv/bin/python -m pip install --no-input --disable-pip-version-check --no-deps --only-binary :all: \
+  if ! .venv/bin/python -m pip install --no-input --disable-pip-version-check --no-deps \
       --requirement "requirements/$underlay.txt" > "$log" 2>&1; then
     if grep -qE 'Retrying|Connection|resolve' "$log"; then
       fail "no package registry reachable: check the network, or pip's index-url and proxy (see $log)"
