@@ -135,18 +135,17 @@ def model(parameters: CantileverParameters) -> CantileverModel:
     )
 
 
-def rest(parameters: CantileverParameters, temperature_degc: float) -> CantileverState:
+def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> CantileverState:
     """Return the state at rest at 0 V, in equilibrium with `temperature_degc`."""
-    sampled = model(parameters)
     return CantileverState(
         [0.0, 0.0],
-        State([0.0] * len(sampled.operator.weights), [0.0, 0.0]),
+        State([0.0] * len(m.operator.weights), [0.0, 0.0]),
         [0.0, 0.0],
         [temperature_degc, temperature_degc],
         [0.0],
-        [0.0] * len(sampled.creep_retained),
+        [0.0] * len(m.creep_retained),
         [0.0, 0.0],
-        [0.0] * (parameters.sensor.delay_samples + 1),
+        [0.0] * (delay_samples + 1),
     )
 
 
@@ -197,7 +196,7 @@ class Cantilever:
 
     def reset(self) -> None:
         """Go back to sample 0: at rest, 0 V, random draws from the seed."""
-        self._state = rest(self.parameters, REFERENCE_DEGC)
+        self._state = rest(self._model, self.parameters.sensor.delay_samples, REFERENCE_DEGC)
         self._generators = generators(self.parameters.seed)
         self._draws = iter(())
         self.samples = 0

@@ -197,14 +197,15 @@ def finger_at_rest(
     """Return coefficients and initial states of a finger, as float64 arrays."""
     law = feedforward_law.Feedforward(feedforward, plant.sample_time)
     order = feedback.order
+    sampled = cantilever.model(plant)
     return _arrays(
         Finger(
             feedback_law.feedback_coefficients(feedback),
             FeedbackState([0.0] * order, [0.0] * order),
             law.coefficients,
             law.state,
-            cantilever.model(plant),
-            cantilever.rest(plant, temperature_degc),
+            sampled,
+            cantilever.rest(sampled, plant.sensor.delay_samples, temperature_degc),
         )
     )
 

@@ -83,7 +83,11 @@ def temperature(parameters: TemperatureParameters, first: int, count: int) -> np
         return _random_walk(p, first + count)[first:]
     time = np.arange(first, first + count) * p.period
     if p.profile == "replay":
-        return np.interp(time, *_recording(p.file, p.topic))
+        try:
+            changed = Path(p.file).stat().st_mtime_ns
+        except OSError as error:
+            raise ParameterError(f"{p.file}: cannot be read: {error}") from None
+        return np.interp(time, *_recording(p.file, p.topic, changed))
     return p.base_degc + p.amplitude_degc * _shape(p, time - p.start)
 
 
@@ -135,7 +139,8 @@ def _walk(seed: int, period: float, time_constant: float, count: int) -> np.ndar
 
 
 @functools.lru_cache(maxsize=4)
-def _recording(file: str, topic: str) -> tuple[np.ndarray, np.ndarray]:
+def _recording(file: str, topic: str, changed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return time (s) and temperature (°C); `changed` tells one state of the file from another."""
     path = Path(file)
     if path.is_dir():
         time, values = _read_bag(path, topic)
@@ -200,7 +205,7 @@ def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
                 stamp = message.header.stamp
                 nanoseconds.append(stamp.sec * 10**9 + stamp.nanosec)
                 values.append(message.temperature)
-    except AnyReaderError as error:
+    except (AnyReaderError, OSError) as error:
         raise ParameterError(f"{path}: cannot be read as a bag: {error}") from None
     bad = [n for n, value in enumerate(values) if not math.isfinite(value)]
     if bad or not values:
