@@ -10,6 +10,7 @@ import ctypes
 import os
 import shutil
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,8 +22,10 @@ from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters
 from piezo_control.parameters import build, load
-from piezo_sim import engine
+from piezo_control.profile import Profile
+from piezo_sim import engine, monte_carlo
 from piezo_sim.cantilever import CantileverParameters
+from piezo_sim.temperature import TemperatureParameters
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAYS = 10
@@ -161,7 +164,7 @@ def loop_against_c() -> list[dict[str, Any]]:
     finger = engine.finger_at_rest(
         CantileverParameters(hysteresis=hysteresis),
         FeedforwardParameters(hysteresis=hysteresis),
-        build(FeedbackParameters, load(ROOT / "params" / "feedback_paper.yaml", "feedback")),
+        _paper_controller(),
         22.0,
     )
     instants = np.arange(SAMPLES) * 1e-4
@@ -197,6 +200,54 @@ def loop_against_c() -> list[dict[str, Any]]:
     return [row("engine, closed loop, 10 plays each way", best[0], "samples/s", best[1])]
 
 
+def long_run(engine_rate: float) -> list[dict[str, Any]]:
+    """Creep experiment: 40 V for 300 s at 10 kHz, against as many samples of the bare loop."""
+    samples = 3_000_000
+    plant = CantileverParameters()
+    step = Profile([0.0], [40.0])
+    engine.drive(plant, TemperatureParameters(), step, 1)
+    start = time.perf_counter()
+    engine.drive(plant, TemperatureParameters(), step, samples, every=100)
+    seconds = time.perf_counter() - start
+    return [row("creep experiment, 300 s at 10 kHz", seconds, "s", samples / engine_rate)]
+
+
+def monte_carlo_study(engine_rate: float) -> list[dict[str, Any]]:
+    """10,000 step responses with metrics on all cores, against their samples in the bare loop."""
+    draws = 10_000
+    study = monte_carlo.Study(feedback=_paper_controller())
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        monte_carlo.monte_carlo(study, draws, folder)
+        seconds = time.perf_counter() - start
+    bare = draws * study.samples / engine_rate
+    return [row("Monte Carlo, 10,000 steps of 60 ms", seconds, "s", bare)]
+
+
+def import_time() -> list[dict[str, Any]]:
+    """Fresh interpreter to imported laws, as a node has to wait for them, against numpy alone."""
+    best = {}
+    for module in ("piezo_sim.engine", "numpy"):
+        seconds = []
+        for _ in range(REPEATS):
+            start = time.perf_counter()
+            subprocess.run([sys.executable, "-c", f"import {module}"], check=True, cwd=ROOT)
+            seconds.append(time.perf_counter() - start)
+        best[module] = min(seconds)
+    return [row("import of laws and engine", best["piezo_sim.engine"], "s", best["numpy"])]
+
+
+def rows() -> list[dict[str, Any]]:
+    """Return all rows."""
+    loop = loop_against_c()
+    rate = loop[0]["value"]
+    return [*loop, *long_run(rate), *monte_carlo_study(rate), *import_time()]
+
+
+def _paper_controller() -> FeedbackParameters:
+    return build(FeedbackParameters, load(ROOT / "params" / "feedback_paper.yaml", "feedback"))
+
+
 def row(name: str, value: float, unit: str, reference: float) -> dict[str, Any]:
     """Return one row of bench.json."""
     ratio = value / reference
@@ -204,5 +255,5 @@ def row(name: str, value: float, unit: str, reference: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    for line in loop_against_c():
+    for line in rows():
         print(line)
