@@ -19,31 +19,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from rosbags.interfaces import Connection
 
 from piezo_control import finger_node
 from piezo_control.finger_node import FingerNode
 from piezo_control.parameters import parameter
 from piezo_control.qos import LATCHED, SAMPLE
+from piezo_control.recording import PROFILE_TYPE, SAMPLE_TYPE, TEMPERATURE_TYPE
 from piezo_gripper_msgs.msg import RecorderState
+from piezo_sim.bag_writer import BagWriter
 
-SAMPLE_TYPE = "piezo_gripper_msgs/msg/Sample"
-TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
-PROFILE_TYPE = "piezo_gripper_msgs/msg/Profile"
 FINGER = {
     "reference": (SAMPLE_TYPE, SAMPLE),
     "reference_profile": (PROFILE_TYPE, LATCHED),
@@ -95,8 +82,7 @@ class RecorderNode(FingerNode):
         super().__init__()
         self.states = self.create_publisher(RecorderState, "recorder_state", LATCHED)
         self.create_timer(STATE_PERIOD, self._publish_state)
-        self.typestore = get_typestore(Stores.ROS2_JAZZY)
-        self.writer: Writer | None = None
+        self.writer: BagWriter | None = None
         self.inputs: list[Any] = []
         self.latched: dict[str, bytes] = {}
         self.tracks: dict[str, Track] = {}
@@ -124,25 +110,11 @@ class RecorderNode(FingerNode):
 
     def start(self) -> None:
         bag = Path(self.parameters.bag or time.strftime("finger_%Y-%m-%d_%H-%M-%S"))
-        if bag.exists():
-            raise ValueError(f"'bag' is '{bag}', which exists; name a new folder")
-        writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
-        try:
-            writer.open()
-        except OSError as error:
-            raise ValueError(f"'bag' is '{bag}', which cannot be written: {error}") from None
+        writer = BagWriter(bag)
         self.tracks = {}
         for topic, (name, qos) in self.types.items():
-            learn(self.typestore, name)
-            connection = writer.add_connection(
-                self.resolve_topic_name(topic),
-                name,
-                typestore=self.typestore,
-                offered_qos_profiles=[bag_qos(qos)],
-            )
-            fields = self.typestore.fielddefs[name][1]
-            has_header = bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
-            self.tracks[topic] = Track(topic, connection, has_header)
+            connection = writer.add(self.resolve_topic_name(topic), name, qos)
+            self.tracks[topic] = Track(topic, connection, writer.has_header(name))
         self.writer = writer
         for topic, data in self.latched.items():
             self._write(topic, data)
@@ -174,7 +146,9 @@ class RecorderNode(FingerNode):
 
     def _write(self, topic: str, data: bytes) -> None:
         if self.types[topic][1].durability == DurabilityPolicy.TRANSIENT_LOCAL:
-            self.latched[topic] = data  # what a profile said before the run began belongs to the run
+            self.latched[topic] = (
+                data  # what a profile said before the run began belongs to the run
+            )
         if self.writer is None:
             return
         track = self.tracks[topic]
@@ -214,33 +188,6 @@ class RecorderNode(FingerNode):
         state.duplicates = [t.duplicates for t in tracks.values()]
         state.missing = [t.missing for t in tracks.values()]
         self.states.publish(state)
-
-
-def learn(typestore: Typestore, name: str) -> None:
-    """Register message `name` and the other messages of its package, unless it is known."""
-    if name in typestore.types:
-        return
-    package = name.split("/")[0]
-    types = {}
-    for path in (Path(get_package_share_directory(package)) / "msg").glob("*.msg"):
-        types.update(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
-    typestore.register(types)
-
-
-def bag_qos(qos: QoSProfile) -> Qos:
-    """Return what a player should offer for a topic that was subscribed with `qos`."""
-    forever = QosTime(2147483647, 4294967295)
-    return Qos(
-        QosHistory.KEEP_LAST,
-        qos.depth,
-        QosReliability(int(qos.reliability)),
-        QosDurability(int(qos.durability)),
-        forever,
-        forever,
-        QosLiveliness.AUTOMATIC,
-        forever,
-        False,
-    )
 
 
 def main() -> int:
