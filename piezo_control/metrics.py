@@ -1,7 +1,7 @@
-"""Figures that describe a response: settling, overshoot, static error, band.
+"""Figures that describe a response: settling, overshoot, static error, loop width, band, rejection.
 
-Every figure is defined in its docstring; times are measured from the step, relative figures are
-fractions (0.05 is 5 %) of the step, that is of the change of the reference.
+Every figure is defined in its docstring. Times of a step response are measured from the step, its
+relative figures are fractions (0.05 is 5 %) of the step, that is of the change of the reference.
 """
 
 from __future__ import annotations
@@ -105,6 +105,227 @@ def _first_crossing(time: np.ndarray, value: np.ndarray, level: float) -> float:
         return float(time[0])
     return float(
         time[i - 1] + (level - value[i - 1]) / (value[i] - value[i - 1]) * (time[i] - time[i - 1])
+    )
+
+
+class Ringing(NamedTuple):
+    """Free vibration, see :func:`ringing`."""
+
+    frequency_hz: float
+    damping_ratio: float
+
+
+def ringing(time: ArrayLike, value: ArrayLike, least: float = 0.05) -> Ringing:
+    """Return frequency and damping ratio of a vibration that dies away.
+
+    The vibration is the difference from the mean of the last tenth of the record. Its frequency is that
+    of its zero crossings, between samples by linear interpolation; its damping ratio follows from the
+    slope of log(extreme) from half-wave to half-wave (logarithmic decrement), both over the half-waves
+    whose extreme is at least `least` of the largest one. 1-D arrays with shape (nsamples,); `time` in s.
+
+    Raises ValueError when there are fewer than four such half-waves.
+    """
+    time = np.asarray(time, dtype=float)
+    value = np.asarray(value, dtype=float)
+    swing = value - np.mean(value[-max(1, time.size // 10) :])
+    before = np.flatnonzero(np.diff(np.signbit(swing)))
+    part = swing[before] / (swing[before] - swing[before + 1])
+    crossing = time[before] + part * (time[before + 1] - time[before])
+    extreme = np.array([np.max(np.abs(swing[i + 1 : j + 1])) for i, j in zip(before, before[1:])])
+    count = int(np.argmin(np.append(extreme >= least * np.max(extreme, initial=0.0), False)))
+    if count < 4:
+        raise ValueError(f"the record has {count} half-waves of a vibration, needs 4 or more")
+    decrement = -np.polyfit(np.arange(count), np.log(extreme[:count]), 1)[0] / np.pi
+    return Ringing(
+        frequency_hz=float(count / (2.0 * (crossing[count] - crossing[0]))),
+        damping_ratio=float(decrement / np.hypot(1.0, decrement)),
+    )
+
+
+def drift(time: ArrayLike, value: ArrayLike, begin: float, average: float) -> float:
+    """Return the change of `value` from time[0] + `begin` to the end, in its unit: creep.
+
+    Both are means over `average` seconds: the ones that follow `begin`, and the last ones.
+    """
+    time = np.asarray(time, dtype=float)
+    value = np.asarray(value, dtype=float)
+    since = time - time[0]
+    first = value[(since >= begin) & (since < begin + average)]
+    last = value[since > since[-1] - average]
+    return float(np.mean(last) - np.mean(first))
+
+
+class LoopMetrics(NamedTuple):
+    """Figures of a loop, see :func:`loop_metrics`."""
+
+    width: float
+    relative_width: float
+    slope: float
+    peak_to_peak: float
+
+
+def last_cycle(drive: ArrayLike) -> slice:
+    """Return the samples of the last cycle of a periodic signal, from its maximum to its maximum.
+
+    A maximum is the middle of the samples in a row that are within 0.1 % of the range below the highest
+    value. Raises ValueError when there are fewer than two.
+    """
+    drive = np.asarray(drive, dtype=float)
+    high = drive >= np.max(drive) - 1e-3 * np.ptp(drive)
+    edges = np.flatnonzero(np.diff(high.astype(int), prepend=0, append=0))
+    tops = (edges[::2] + edges[1::2] - 1) // 2
+    if tops.size < 2:
+        raise ValueError(f"the signal has {tops.size} maxima, a cycle needs two")
+    return slice(int(tops[-2]), int(tops[-1]) + 1)
+
+
+def loop_metrics(drive: ArrayLike, value: ArrayLike) -> LoopMetrics:
+    """Return the figures of one cycle, `value` over `drive`, from maximum to maximum of `drive`.
+
+    Parameters
+    ----------
+    drive, value : array_like
+        1-D arrays with shape (nsamples,): voltage or reference, and deflection; `drive` has to fall to
+        its minimum and to rise from there.
+
+    Returns
+    -------
+    LoopMetrics
+        * ``width``: largest difference of `value` between the two branches at equal `drive`;
+        * ``relative_width``: the same as a fraction of ``peak_to_peak``;
+        * ``slope``: of the straight line with the least squared error through all samples;
+        * ``peak_to_peak``: range of `value`.
+    """
+    drive = np.asarray(drive, dtype=float)
+    value = np.asarray(value, dtype=float)
+    turn = int(np.argmin(drive))
+    low, high = drive[turn], min(drive[0], drive[-1])
+    grid = np.linspace(low, high, 2001)
+    falling = np.interp(grid, drive[turn::-1], value[turn::-1])
+    rising = np.interp(grid, drive[turn:], value[turn:])
+    width = float(np.max(np.abs(falling - rising)))
+    spread = float(np.ptp(value))
+    slope = float(np.polyfit(drive, value, 1)[0])
+    return LoopMetrics(width, width / spread, slope, spread)
+
+
+class FrequencyResponse(NamedTuple):
+    """Measured response: 1-D arrays of angular frequency (rad/s) and complex gain."""
+
+    frequency: np.ndarray
+    gain: np.ndarray
+
+    @property
+    def magnitude_db(self) -> np.ndarray:
+        """Magnitude in dB."""
+        return 20.0 * np.log10(np.abs(self.gain))
+
+
+def frequency_response(
+    time: ArrayLike, drive: ArrayLike, value: ArrayLike, least: float = 1e-2
+) -> FrequencyResponse:
+    """Return the response of `value` to `drive` at the frequencies that `drive` contains.
+
+    When the second half of `drive` repeats the first (a multisine of two periods) the second halves are
+    transformed: value(jw) / drive(jw) at the lines of `drive` that reach `least` of its highest one;
+    nothing leaks between lines, and the first half lets the transient die away. Any other `drive` (a
+    chirp, noise) gives the H1 estimate, cross spectrum by auto spectrum, of segments of a quarter of
+    the record (Welch, Hann window, half overlapping), where the auto spectrum reaches ``least**2`` of
+    its highest value. 1-D arrays with shape (nsamples,), evenly spaced in time (s).
+    """
+    time = np.asarray(time, dtype=float)
+    drive = np.asarray(drive, dtype=float)
+    value = np.asarray(value, dtype=float)
+    spacing = float(time[-1] - time[0]) / (time.size - 1)
+    half = time.size // 2
+    repeats = np.allclose(drive[:half], drive[half : 2 * half], rtol=0.0, atol=1e-6 * np.ptp(drive))
+    if repeats:
+        frequency = np.fft.rfftfreq(half, spacing)
+        given, got = (np.fft.rfft(signal[half : 2 * half]) for signal in (drive, value))
+        strength = np.abs(given)
+    else:
+        from scipy.signal import csd, welch
+
+        segments = {"fs": 1.0 / spacing, "nperseg": time.size // 4}
+        frequency, given = welch(drive, **segments)
+        got = csd(drive, value, **segments)[1]
+        strength = np.sqrt(given)
+    strong = strength >= least * np.max(strength[1:])
+    strong[0] = False
+    return FrequencyResponse(2.0 * np.pi * frequency[strong], got[strong] / given[strong])
+
+
+def bandwidth(response: FrequencyResponse, level_db: float = -3.0) -> float:
+    """Return the angular frequency (rad/s) at which the magnitude first falls below `level_db`.
+
+    The level counts from the magnitude at the lowest frequency; between lines the magnitude in dB is a
+    straight line over log(frequency). Infinite when the magnitude stays above.
+    """
+    magnitude = response.magnitude_db - response.magnitude_db[0] - level_db
+    below = np.flatnonzero(magnitude < 0.0)
+    if below.size == 0:
+        return float("inf")
+    i = below[0]
+    part = magnitude[i - 1] / (magnitude[i - 1] - magnitude[i])
+    low, high = np.log(response.frequency[i - 1 : i + 1])
+    return float(np.exp(low + part * (high - low)))
+
+
+class DisturbanceMetrics(NamedTuple):
+    """Figures of a held value under a disturbance, see :func:`disturbance_metrics`."""
+
+    change: float
+    excursion: float
+    rejection: float
+    remaining: float
+    recovery_s: float
+
+
+def disturbance_metrics(
+    time: ArrayLike,
+    value: ArrayLike,
+    disturbance: ArrayLike,
+    average: float = 0.0,
+    window: float = 0.02,
+) -> DisturbanceMetrics:
+    """Return what a disturbance (temperature, force) does to a value that is to be held.
+
+    Parameters
+    ----------
+    time, value, disturbance : array_like
+        1-D arrays with shape (nsamples,). The disturbance begins with its first change; the value held
+        is the mean of the `window` seconds before.
+    average : float
+        Seconds of a moving average of `value`, against sensor noise where the disturbance is slow.
+
+    Returns
+    -------
+    DisturbanceMetrics
+        * ``change``: the change of the disturbance furthest from its first value;
+        * ``excursion``: largest distance of `value` from the value held, from the beginning on;
+        * ``rejection``: excursion per unit of the change (m/°C, m/N), so smaller is better;
+        * ``remaining``: mean of the last `window` seconds minus the value held;
+        * ``recovery_s``: time from the beginning until `value` stays within 5 % of the excursion around
+          that last mean; infinite when it does not.
+
+    Raises ValueError when the disturbance does not change, or at once.
+    """
+    time = np.asarray(time, dtype=float)
+    value = np.asarray(value, dtype=float)
+    departure = np.asarray(disturbance, dtype=float) - disturbance[0]
+    begin = int(np.argmax(departure != 0.0))
+    if begin == 0:
+        raise ValueError("the disturbance does not change after the first sample")
+    held = np.mean(value[(time >= time[begin] - window) & (time < time[begin])])
+    last = np.mean(value[time > time[-1] - window])
+    count = max(1, round(average * (time.size - 1) / (time[-1] - time[0])))
+    after = np.convolve(value[begin:], np.full(count, 1.0 / count), mode="valid")
+    excursion = float(np.max(np.abs(after - held)))
+    change = float(departure[np.argmax(np.abs(departure))])
+    late = time[begin + count - 1 :]
+    recovery = late[0] - time[begin] + settling_time(late, after, last, 0.05 * excursion)
+    return DisturbanceMetrics(
+        change, excursion, excursion / abs(change), float(last - held), float(recovery)
     )
 
 
