@@ -36,6 +36,7 @@ setup(
             "temperature = piezo_sim.temperature_node:main",
             "feedforward = piezo_control.feedforward_node:main",
             "feedback = piezo_control.feedback_node:main",
+            "finger = piezo_sim.finger:main",
             "recorder = piezo_sim.recorder_node:main",
             "experiment = piezo_sim.experiment.cli:main",
             "identify = piezo_control.identify:main",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import rclpy
@@ -151,40 +151,48 @@ def describe(name: str, kind: type, field: Any) -> ParameterDescriptor:
     return descriptor
 
 
-def run(node_type: type[FingerNode]) -> int:
-    """Run one node until SIGINT or SIGTERM and return the process' exit code."""
-    parse(node_type)
+def run(*node_types: type[FingerNode]) -> int:
+    """Run nodes in this process until SIGINT or SIGTERM; return its exit code.
+
+    Several nodes start in the order given and stop in the opposite one.
+    """
+    parse(node_types)
     spin.init()
     stop = spin.stop_event()
+    nodes: list[FingerNode] = []
     try:
-        node = node_type()
+        for node_type in node_types:
+            nodes.append(node_type())
+        for node in nodes:
+            if node.get_parameter("autostart").value:
+                node.trigger_configure()
+                node.trigger_activate()
+        spin.spin(nodes, stop.is_set)
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
-        print(f"{node_type.NAME}: {error}", file=sys.stderr)
-        rclpy.try_shutdown()
+        print(f"{node_types[len(nodes)].NAME}: {error}", file=sys.stderr)
         return 2
-    if node.get_parameter("autostart").value:
-        node.trigger_configure()
-        node.trigger_activate()
-    try:
-        spin.spin([node], stop.is_set)
     finally:
-        node.trigger_shutdown()
-        node.destroy_node()
+        for node in reversed(nodes):
+            node.trigger_shutdown()
+            node.destroy_node()
         rclpy.try_shutdown()
     return 0
 
 
-def parse(node_type: type[FingerNode]) -> None:
-    """Serve `--help`: what the node does, and every parameter with default, unit and range."""
-    lines = ["parameters (--ros-args -p NAME:=VALUE, or --params-file FILE):"]
-    for name, (kind, field) in declarations(node_type.PARAMETERS).items():
-        default = list(field.default) if isinstance(field.default, tuple) else field.default
-        lines.append(f"  {name} = {default}\n      {describe(name, kind, field).description}")
+def parse(node_types: Sequence[type[FingerNode]]) -> None:
+    """Serve `--help`: what the nodes do, and every parameter with default, unit and range."""
+    description, parameters = [], []
+    for node_type in node_types:
+        description.append(f"node '{node_type.NAME}': {sys.modules[node_type.__module__].__doc__}")
+        parameters.append(f"parameters of '{node_type.NAME}':")
+        for name, (kind, field) in declarations(node_type.PARAMETERS).items():
+            default = list(field.default) if isinstance(field.default, tuple) else field.default
+            parameters.append(f"  {name} = {default}")
+            parameters.append(f"      {describe(name, kind, field).description}")
     parser = argparse.ArgumentParser(
-        prog=node_type.NAME,
-        description=sys.modules[node_type.__module__].__doc__,
-        epilog="\n".join(lines),
+        description="\n".join(description),
+        epilog="\n".join(parameters),
         formatter_class=argparse.RawDescriptionHelpFormatter,
-        usage="%(prog)s [-h] [--ros-args …]",
+        usage="%(prog)s [-h] [--ros-args -p NAME:=VALUE … --params-file FILE -r __ns:=/FINGER …]",
     )
     parser.parse_args(remove_ros_args(sys.argv)[1:])

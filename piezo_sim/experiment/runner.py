@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from piezo_control import spin
 from piezo_gripper_msgs.msg import FingerState
-from piezo_sim.experiment.cases import NODES, Case
+from piezo_sim.experiment.cases import NODES, Case, params_folder
 from piezo_sim.experiment.conductor import Conductor, RunFailed
 from piezo_sim.experiment.processes import NodeProcesses
 
@@ -44,6 +44,8 @@ def run_cases(
     SIGTERM. Whatever happens, no process is left behind.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    discovery = params_folder() / "discovery.xml"
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(discovery))
     spin.init()
     stop = spin.stop_event()
     commands = {
