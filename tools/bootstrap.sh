@@ -47,6 +47,11 @@ check_platform() {  # the wheels exist for one platform only
     fail "unsupported C library ${libc:-(not glibc)}: the ROS 2 wheels need glibc 2.28 or newer"
 }
 
+check_tools() {  # the message package is compiled
+  command -v g++ > /dev/null || fail "no C++ compiler: install g++ (apt install g++)"
+  command -v cmake > /dev/null || fail "no CMake: install cmake (apt install cmake)"
+}
+
 install_pins() {
   local python log=log/pip.log
   if [ ! -x .venv/bin/python ] || ! .venv/bin/python -c 'import pip' 2>/dev/null; then
@@ -71,9 +76,6 @@ install_pins() {
 }
 
 build_packages() {
-  command -v g++ > /dev/null || fail "no C++ compiler: install g++ (apt install g++)"
-  command -v cmake > /dev/null || fail "no CMake: install cmake (apt install cmake)"
-  command -v make > /dev/null || fail "no make: install make (apt install make)"
   say "building piezo_gripper_msgs and piezo_gripper into install/ (half a minute at first)"
   # sourced scripts of others may read unset variables
   set +u
@@ -110,15 +112,8 @@ if [ -f .venv/place ] && [ "$(<.venv/place)" != "$place" ]; then
   rm -rf .venv build install
 fi
 
-pins=$(cat requirements/*.txt | fingerprint)
-if [ "$(cat .venv/pins 2>/dev/null)" != "$pins" ]; then
-  [ "$underlay" = jazzy ] || check_platform
-  install_pins
-  echo "$place" > .venv/place
-  echo "$pins" > .venv/pins
-fi
-
 # Editing a module needs no build: install/ links to it. A new file in params/ or launch/ does, or a new Python package.
+pins=$(cat requirements/*.txt | fingerprint)
 sources=$({
   echo "$place $pins"
   cat package.xml setup.py setup.cfg tools/*.bash tools/*.cmake
@@ -126,8 +121,17 @@ sources=$({
     grep -v __pycache__ | LC_ALL=C sort
   find msg_defs -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
 } | fingerprint)
-if [ "$(cat install/sources 2>/dev/null)" != "$sources" ]; then
-  build_packages
-  echo "$sources" > install/sources
-  say "ready; '. ./setup.bash' gives a shell in which the nodes start by name"
+if [ "$(cat .venv/pins install/sources 2>/dev/null)" = "$pins"$'\n'"$sources" ]; then
+  exit
 fi
+
+check_tools
+if [ "$(cat .venv/pins 2>/dev/null)" != "$pins" ]; then
+  [ "$underlay" = jazzy ] || check_platform
+  install_pins
+  echo "$place" > .venv/place
+  echo "$pins" > .venv/pins
+fi
+build_packages
+echo "$sources" > install/sources
+say "ready; '. ./setup.bash' gives a shell in which the nodes start by name"
