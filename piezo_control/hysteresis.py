@@ -188,21 +188,37 @@ def _invert_side(
 
 def plays_output(c: Coefficients, s: State, value: float) -> float:
     """Return sum w_i z_i for the next input `value`, leaving the plays where they are."""
+    thresholds, weights, plays = c.thresholds, c.weights, s.plays
     growth = c.dilation * s.drive[1]
-    total = c.weights[0] * value
-    for i in range(1, len(c.weights)):
-        threshold = c.thresholds[i] + growth
-        total += c.weights[i] * min(value + threshold, max(value - threshold, s.plays[i]))
+    total = weights[0] * value
+    for i in range(1, len(weights)):
+        threshold = thresholds[i] + growth
+        play = plays[i]
+        if play < value - threshold:
+            play = value - threshold
+        elif play > value + threshold:
+            play = value + threshold
+        total += weights[i] * play
     return total
 
 
-def plays_move(c: Coefficients, s: State, value: float) -> None:
-    """Move the plays to the input `value`."""
+def plays_move(c: Coefficients, s: State, value: float) -> float:
+    """Move the plays to the input `value` and return sum w_i z_i."""
+    thresholds, weights, plays = c.thresholds, c.weights, s.plays
     growth = c.dilation * s.drive[1]
-    s.plays[0] = value
-    for i in range(1, len(c.weights)):
-        threshold = c.thresholds[i] + growth
-        s.plays[i] = min(value + threshold, max(value - threshold, s.plays[i]))
+    plays[0] = value
+    total = weights[0] * value
+    for i in range(1, len(weights)):
+        threshold = thresholds[i] + growth
+        play = plays[i]
+        if play < value - threshold:
+            play = value - threshold
+            plays[i] = play
+        elif play > value + threshold:
+            play = value + threshold
+            plays[i] = play
+        total += weights[i] * play
+    return total
 
 
 def map_plays(c: Coefficients, s: State) -> None:
@@ -239,8 +255,7 @@ def remember_voltage(s: State, voltage: float) -> None:
 
 def operator_step(operator: Coefficients, s: State, voltage: float) -> float:
     """Apply `voltage` (V) to the operator and return the deflection (m)."""
-    hysteresis = plays_output(operator, s, voltage)
-    plays_move(operator, s, voltage)
+    hysteresis = plays_move(operator, s, voltage)
     remember_voltage(s, voltage)
     return dead_zones(operator, hysteresis)
 
