@@ -288,10 +288,8 @@ class Cantilever:
 
 def generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Return the generators of the sensor's noise and of its drop-outs."""
-    noise, dropouts = np.random.SeedSequence(seed).spawn(2)
-    return np.random.Generator(np.random.PCG64(noise)), np.random.Generator(
-        np.random.PCG64(dropouts)
-    )
+    stream = np.random.PCG64(seed)
+    return np.random.Generator(stream), np.random.Generator(stream.jumped())
 
 
 def draws(

@@ -56,7 +56,7 @@ AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
-class Recording:
+class Run:
     """Signals of one run, 1-D arrays with shape (nsamples,) in SI units and °C.
 
     `deflection` is what the sensor said, `true_deflection` where the tip was; `voltage` is the
@@ -116,7 +116,7 @@ def run(
     tip_force: Profile | None = None,
     every: int = 1,
     compiled: bool | None = None,
-) -> Recording:
+) -> Run:
     """Run one finger for `samples` samples and return every `every`-th of them.
 
     Parameters
@@ -158,7 +158,7 @@ def run(
         )
         loop(finger, inputs, first, every, outputs)
     amplifier_clips = finger.plant_state.amplifier[1]
-    return Recording(
+    return Run(
         time[::every],
         references[::every],
         outputs.deflection,
@@ -178,7 +178,7 @@ def drive(
     samples: int,
     tip_force: Profile | None = None,
     every: int = 1,
-) -> Recording:
+) -> Run:
     """Apply a `voltage` profile (V) to the bare cantilever; reference and command are that voltage."""
     limit = plant.amplifier.voltage_limit
     straight = FeedforwardParameters(

@@ -87,14 +87,14 @@ def test_samples_do_not_depend_on_how_they_are_grouped(monkeypatch):
     expected = run()
     monkeypatch.setattr(engine, "AT_ONCE", 37)
     got = run()
-    for field in dataclasses.fields(engine.Recording):
+    for field in dataclasses.fields(engine.Run):
         assert np.array_equal(getattr(got, field.name), getattr(expected, field.name))
 
 
 @pytest.mark.parametrize("every", [2, 7, 600])
 def test_every_nth_sample_is_taken_down(every):
     all_of_them, some = run(), run(every=every)
-    for field in dataclasses.fields(engine.Recording)[:-1]:
+    for field in dataclasses.fields(engine.Run)[:-1]:
         expected = getattr(all_of_them, field.name)[::every]
         assert np.array_equal(getattr(some, field.name), expected), field.name
 
