@@ -1,0 +1,40 @@
+"""Writes docs/parameters.md, the tables of every node's parameters, from their declarations."""
+
+from pathlib import Path
+
+from piezo_control.feedback_node import FeedbackNode
+from piezo_control.feedforward_node import FeedforwardNode
+from piezo_control.finger_node import FingerNode, describe
+from piezo_control.parameters import declarations
+from piezo_sim.cantilever_node import CantileverNode
+from piezo_sim.recorder_node import RecorderNode
+from piezo_sim.temperature_node import TemperatureNode
+
+NODES = (CantileverNode, TemperatureNode, FeedforwardNode, FeedbackNode, RecorderNode)
+LONGEST = 40  # characters of a default that a table still shows
+
+
+def table(node: type[FingerNode]) -> str:
+    """Return the node's parameters as a Markdown table."""
+    lines = [f"## {node.NAME}", "", "| parameter | default | meaning |", "| --- | --- | --- |"]
+    for name, (kind, field) in declarations(node.PARAMETERS).items():
+        default = str(list(field.default) if isinstance(field.default, tuple) else field.default)
+        if len(default) > LONGEST:
+            default = f"{len(field.default)} numbers"
+        meaning = describe(name, kind, field).description.replace("|", "\\|")
+        lines.append(f"| `{name}` | {default} | {meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+def page() -> str:
+    """Return the whole page."""
+    head = (
+        "# Parameters of the nodes\n\nWritten by `python docs/parameters.py` from the declarations in the "
+        "code; `NODE --help` prints the same. Every node has `autostart` (default true: configure and "
+        "activate at start) besides.\n"
+    )
+    return "\n".join([head, *map(table, NODES)])
+
+
+if __name__ == "__main__":
+    Path(__file__).with_suffix(".md").write_text(page())
