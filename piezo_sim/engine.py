@@ -40,6 +40,7 @@ from piezo_control.feedforward import (
 )
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
+from piezo_control.recording import Recording
 from piezo_sim import amplifier, cantilever, contact, creep, dynamics, sensor, thermal, truth
 from piezo_sim.cantilever import (
     CantileverModel,
@@ -56,22 +57,15 @@ AT_ONCE = 1 << 16
 
 
 @dataclass(frozen=True)
-class Run:
-    """Signals of one run, 1-D arrays with shape (nsamples,) in SI units and °C.
+class Run(Recording):
+    """A recording of every signal, and what no sensor says.
 
-    `deflection` is what the sensor said, `true_deflection` where the tip was; `voltage` is the
-    demand on the amplifier, `tip_force` the sum of external and contact force. `clipped` counts the
-    samples at which feedforward or amplifier limited the voltage.
+    `true_deflection` (m) is where the tip was, `total_force` (N) the sum of external and contact force,
+    `clipped` the number of samples at which feedforward or amplifier limited the voltage.
     """
 
-    time: np.ndarray
-    reference: np.ndarray
-    deflection: np.ndarray
-    command: np.ndarray
-    voltage: np.ndarray
-    temperature: np.ndarray
-    tip_force: np.ndarray
     true_deflection: np.ndarray
+    total_force: np.ndarray
     clipped: int
 
 
@@ -91,7 +85,7 @@ class Outputs(NamedTuple):
     deflection: np.ndarray
     command: np.ndarray
     voltage: np.ndarray
-    tip_force: np.ndarray
+    total_force: np.ndarray
     true_deflection: np.ndarray
 
 
@@ -159,15 +153,17 @@ def run(
         loop(finger, inputs, first, every, outputs)
     amplifier_clips = finger.plant_state.amplifier[1]
     return Run(
-        time[::every],
-        references[::every],
-        outputs.deflection,
-        outputs.command,
-        outputs.voltage,
-        degc[::every],
-        outputs.tip_force,
-        outputs.true_deflection,
-        int(finger.feedforward_state.clipped[0] + amplifier_clips),
+        number=np.arange(0, samples, every),
+        time=time[::every],
+        reference=references[::every],
+        deflection=outputs.deflection,
+        command=outputs.command,
+        voltage=outputs.voltage,
+        temperature=degc[::every],
+        tip_force=forces[::every],
+        true_deflection=outputs.true_deflection,
+        total_force=outputs.total_force,
+        clipped=int(finger.feedforward_state.clipped[0] + amplifier_clips),
     )
 
 
@@ -238,7 +234,7 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
             outputs.deflection[row] = deflection
             outputs.command[row] = command
             outputs.voltage[row] = voltage
-            outputs.tip_force[row] = state.tip_force[0]
+            outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 

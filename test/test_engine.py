@@ -64,11 +64,11 @@ def test_samples_are_those_of_the_laws_one_by_one(plant, feedback, compiled):
         plant, FeedforwardParameters(), feedback, TEMPERATURES, REFERENCE, SAMPLES, FORCE,
         compiled=compiled,
     )  # fmt: skip
-    names = ("deflection", "command", "voltage", "true_deflection", "tip_force")
+    names = ("deflection", "command", "voltage", "true_deflection", "total_force")
     for name, signal, tolerance in zip(names, expected, (1e-12, 1e-12, 1e-6, 1e-12, 1e-9)):
         np.testing.assert_allclose(getattr(got, name), signal, rtol=0.0, atol=tolerance)
     assert got.clipped == clipped
-    assert np.ptp(got.tip_force) > 1e-3  # the object was touched, so contact was compared too
+    assert np.ptp(got.total_force) > 1e-3  # the object was touched, so contact was compared too
 
 
 def run(samples=500, **changes):
