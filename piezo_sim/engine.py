@@ -239,6 +239,7 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 
 
+@functools.cache
 def has_numba() -> bool:
     """Say whether the compiler is installed, without importing it."""
     return importlib.util.find_spec("numba") is not None
