@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -92,7 +92,7 @@ def read(
         for name in ("command", "voltage")
     }
     warmth = bag.messages(f"{prefix}temperature", TEMPERATURE_TYPE)
-    return Recording(
+    recording = Recording(
         number=number,
         time=stamps - stamps[0],
         deflection=np.array([deflection[i].value for i in first]),
@@ -102,6 +102,15 @@ def read(
         **sampled,
         **signals,
     )
+    return _without_ragged_end(recording) if bag.damage else recording
+
+
+def _without_ragged_end(recording: Recording) -> Recording:
+    """Cut off the last samples, for which some of the signals that were recorded are missing."""
+    signals = {f.name: getattr(recording, f.name) for f in fields(recording)}
+    present = [np.flatnonzero(np.isfinite(signal)) for signal in signals.values()]
+    end = min(samples[-1] + 1 for samples in present if samples.size)
+    return Recording(**{name: signal[:end] for name, signal in signals.items()})
 
 
 def _deflection_topic(bag: Bag, finger: str) -> str:

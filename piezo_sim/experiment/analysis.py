@@ -1,52 +1,246 @@
-"""From recordings to figures of merit; everything here is computed from bags alone."""
+"""From a recording to its figures of merit; everything here is computed from bags alone.
+
+There is one analysis per kind of experiment, a function of a recording that returns ``{quantity: value}``.
+`QUANTITIES` says how each is shown; a value that does not exist, a settling that never comes, is None.
+The definitions are those of :mod:`piezo_control.metrics`.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 
-from piezo_control.metrics import step_metrics
-from piezo_control.recording import Recording
+from piezo_control import metrics
+from piezo_control.recording import BagError, Recording
 
-STEADY = 0.02  # s before a disturbance over which the held deflection is averaged
+Figures = dict[str, float | int | None]
+
+QUANTITIES = {
+    "reference_um": ("reference [µm]", 1),
+    "final_um": ("final deflection [µm]", 2),
+    "ringing_hz": ("ringing [Hz]", 1),
+    "damping_ratio": ("damping ratio", 4),
+    "rise_time_ms": ("rise 10–90 % [ms]", 2),
+    "settling_time_5pct_ms": ("settling to 5 % [ms]", 1),
+    "settling_time_2pct_ms": ("settling to 2 % [ms]", 1),
+    "overshoot_percent": ("overshoot [%]", 2),
+    "static_error_percent": ("static error [%]", 3),
+    "creep_um": ("creep [µm]", 2),
+    "creep_percent": ("creep [%]", 1),
+    "peak_to_peak_um": ("peak to peak [µm]", 2),
+    "loop_width_um": ("loop width [µm]", 2),
+    "loop_width_percent": ("loop width [%]", 2),
+    "slope": ("slope", 4),
+    "slope_um_per_v": ("slope [µm/V]", 4),
+    "bandwidth_rad_s": ("−3 dB [rad/s]", 0),
+    "lowest_rad_s": ("from [rad/s]", 2),
+    "highest_rad_s": ("to [rad/s]", 0),
+    "peak_db": ("peak [dB]", 2),
+    "temperature_change_degc": ("change of temperature [°C]", 1),
+    "deflection_change_um": ("largest change of deflection [µm]", 3),
+    "rejection_um_per_degc": ("change per degree [µm/°C]", 4),
+    "force_change_mn": ("force [mN]", 2),
+    "change_per_force_um_per_mn": ("change per force [µm/mN]", 3),
+    "recovery_ms": ("recovery to 5 % [ms]", 1),
+    "remaining_um": ("remaining change [µm]", 3),
+    "samples": ("samples", 0),
+}
+"""Quantity to heading and decimals, in the order of the columns."""
+
+AVERAGE = 0.01  # s of the moving average over a deflection that follows a temperature
+CREEP_BEGIN = 1.0  # s after the step from which on slow motion counts as creep
+CREEP_AVERAGE = 0.5  # s
 
 
-def step_row(recording: Recording) -> dict[str, Any]:
-    """Return the figures of a step of the reference at sample 0, from rest.
+def transient(recording: Recording) -> Figures:
+    """Return final deflection, ringing and damping after a step of the voltage (Fig. 3)."""
+    begin = _begin(recording.voltage, "voltage")
+    time, value = recording.time[begin:], recording.deflection[begin:]
+    ringing = metrics.ringing(time, value)
+    return {
+        "final_um": float(np.mean(value[-max(1, value.size // 10) :])) * 1e6,
+        "ringing_hz": ringing.frequency_hz,
+        "damping_ratio": ringing.damping_ratio,
+    }
 
-    Settling is into 5 % of the final value, None when the end of the record is outside; overshoot and
-    static error are in % of the reference (:func:`piezo_control.metrics.step_metrics`).
+
+def creep(recording: Recording) -> Figures:
+    """Return the drift from 1 s after a step of the voltage to the end, also in % of the deflection."""
+    begin = _begin(recording.voltage, "voltage")
+    time, value = recording.time[begin:], recording.deflection[begin:]
+    drift = metrics.drift(time, value, CREEP_BEGIN, CREEP_AVERAGE)
+    final = float(np.mean(value[time > time[-1] - CREEP_AVERAGE]))
+    return {
+        "final_um": final * 1e6,
+        "creep_um": drift * 1e6,
+        "creep_percent": drift / (final - drift) * 100,
+    }
+
+
+def hysteresis(recording: Recording) -> Figures:
+    """Return the figures of the last cycle of deflection over voltage (Fig. 5)."""
+    loop = _loop(recording, "voltage")
+    return {
+        "peak_to_peak_um": loop.peak_to_peak * 1e6,
+        "loop_width_um": loop.width * 1e6,
+        "loop_width_percent": loop.relative_width * 100,
+        "slope_um_per_v": loop.slope * 1e6,
+    }
+
+
+def feedforward(recording: Recording) -> Figures:
+    """Return the figures of the last cycle of deflection over reference (Fig. 9)."""
+    loop = _loop(recording, "reference")
+    return {
+        "slope": loop.slope,
+        "peak_to_peak_um": loop.peak_to_peak * 1e6,
+        "loop_width_um": loop.width * 1e6,
+        "loop_width_percent": loop.relative_width * 100,
+    }
+
+
+def step(recording: Recording) -> Figures:
+    """Return the figures of a step of the reference (Fig. 13).
+
+    A step at sample 0 is one from rest. Settling is into 5 % and 2 % of the final value; overshoot and
+    static error are in % of the step (:func:`piezo_control.metrics.step_metrics`).
     """
+    begin = _begin(recording.reference, "reference")
+    initial = float(recording.reference[begin - 1]) if begin else 0.0
     reference = float(recording.reference[-1])
-    figures = step_metrics(recording.time, recording.deflection, reference)
-    settling = figures.settling_5_final_s * 1e3
+    figures = metrics.step_metrics(
+        recording.time[begin:], recording.deflection[begin:], reference, initial
+    )
     return {
         "reference_um": reference * 1e6,
-        "settling_time_5pct_ms": settling if math.isfinite(settling) else None,
+        "settling_time_5pct_ms": _finite(figures.settling_5_final_s * 1e3),
+        "settling_time_2pct_ms": _finite(figures.settling_2_final_s * 1e3),
+        "rise_time_ms": _finite(figures.rise_s * 1e3),
         "overshoot_percent": figures.overshoot * 100,
         "static_error_percent": figures.static_error * 100,
-        "samples": recording.time.size,
     }
 
 
-def thermal_row(recording: Recording) -> dict[str, float]:
-    """Return what a change of temperature does to a held deflection.
+def frequency(recording: Recording) -> Figures:
+    """Return band and peak of the response of the deflection to the reference (Fig. 14).
 
-    `deflection_change_um` is the largest excursion after the first change of temperature from the mean
-    of the 20 ms before it, `remaining_um` that of the last 20 ms.
+    The peak is relative to the lowest frequency, as the band is.
     """
-    change = int(np.argmax(recording.temperature != recording.temperature[0]))
-    before = recording.time >= recording.time[change] - STEADY
-    before &= recording.time < recording.time[change]
-    held = recording.deflection[before].mean()
-    away = recording.deflection[change:] - held
-    last = recording.deflection[recording.time >= recording.time[-1] - STEADY].mean()
+    response = frequency_response(recording)
+    magnitude = response.magnitude_db
     return {
-        "temperature_change_degc": float(recording.temperature[-1] - recording.temperature[0]),
-        "deflection_change_um": float(np.max(np.abs(away))) * 1e6,
-        "remaining_um": float(last - held) * 1e6,
-        "reference_um": float(recording.reference[-1]) * 1e6,
-        "samples": recording.time.size,
+        "lowest_rad_s": float(response.frequency[0]),
+        "highest_rad_s": float(response.frequency[-1]),
+        "bandwidth_rad_s": _finite(metrics.bandwidth(response)),
+        "peak_db": float(np.max(magnitude) - magnitude[0]),
     }
+
+
+def frequency_response(recording: Recording) -> metrics.FrequencyResponse:
+    """Return the measured response of the deflection to the reference."""
+    _need(recording, "reference")
+    return metrics.frequency_response(recording.time, recording.reference, recording.deflection)
+
+
+def thermal(recording: Recording) -> Figures:
+    """Return what a change of temperature does to a held deflection, averaged over 10 ms."""
+    _need(recording, "temperature")
+    figures = metrics.disturbance_metrics(
+        recording.time, recording.deflection, recording.temperature, AVERAGE
+    )
+    return {
+        "temperature_change_degc": figures.change,
+        "deflection_change_um": figures.excursion * 1e6,
+        "rejection_um_per_degc": figures.rejection * 1e6,
+        "remaining_um": figures.remaining * 1e6,
+        "reference_um": float(recording.reference[-1]) * 1e6,
+    }
+
+
+def force(recording: Recording) -> Figures:
+    """Return what a step of the tip force does to a held deflection."""
+    _need(recording, "tip_force")
+    figures = metrics.disturbance_metrics(recording.time, recording.deflection, recording.tip_force)
+    return {
+        "force_change_mn": figures.change * 1e3,
+        "deflection_change_um": figures.excursion * 1e6,
+        "change_per_force_um_per_mn": figures.rejection * 1e3,
+        "recovery_ms": _finite(figures.recovery_s * 1e3),
+        "remaining_um": figures.remaining * 1e6,
+    }
+
+
+ANALYSES: dict[str, Callable[[Recording], Figures]] = {
+    a.__name__: a
+    for a in (transient, creep, hysteresis, feedforward, step, frequency, thermal, force)
+}
+
+
+def analyse(recording: Recording, kind: str) -> Figures:
+    """Return the figures of a recording as an experiment of `kind`, a key of ANALYSES.
+
+    Raises BagError when the signals are not those of such an experiment.
+    """
+    try:
+        return {**ANALYSES[kind](recording), "samples": int(recording.time.size)}
+    except ValueError as error:
+        raise BagError(f"cannot be analysed as '{kind}': {error}") from None
+
+
+def classify(recording: Recording) -> str:
+    """Return the kind of experiment that the signals of a recording suggest.
+
+    In this order: a tip force that changes, a temperature that changes, a reference of many frequencies,
+    a cyclic one (`hysteresis` when the voltage is proportional to it), a voltage held under a static
+    gain (`creep` when that lasts for more than 10 s), any other reference: a step. Without a reference
+    the voltage decides.
+    """
+    for kind, signal in (("force", recording.tip_force), ("thermal", recording.temperature)):
+        if np.ptp(signal) > 0.0:
+            return kind
+    has_reference = bool(np.all(np.isfinite(recording.reference)))
+    drive = recording.reference if has_reference else recording.voltage
+    if not np.all(np.isfinite(drive)):
+        raise BagError("neither reference nor voltage was recorded: name the kind of experiment")
+    is_static = not has_reference or _is_proportional(recording.voltage, drive)
+    turns = np.count_nonzero(
+        np.diff(np.sign(np.diff(drive[np.diff(drive, prepend=np.nan) != 0.0])))
+    )
+    if turns > 20:
+        return "frequency"
+    if turns > 1:
+        return "hysteresis" if is_static else "feedforward"
+    if not is_static:
+        return "step"
+    return "creep" if recording.time[-1] > 10.0 else "transient"
+
+
+def _is_proportional(value: np.ndarray, drive: np.ndarray) -> bool:
+    gain = np.dot(value, drive) / max(np.dot(drive, drive), 1e-300)
+    return bool(np.max(np.abs(value - gain * drive)) <= 1e-6 * np.max(np.abs(value)))
+
+
+def _begin(signal: np.ndarray, name: str) -> int:
+    """Return the sample from which on a signal has its last value."""
+    if not np.isfinite(signal[-1]):
+        raise ValueError(f"no {name} was recorded")
+    changes = np.flatnonzero(signal != signal[-1])
+    return int(changes[-1]) + 1 if changes.size else 0
+
+
+def _need(recording: Recording, name: str) -> None:
+    if not np.all(np.isfinite(getattr(recording, name))):
+        raise ValueError(f"no {name} was recorded, or not from the beginning")
+
+
+def _loop(recording: Recording, drive: str) -> metrics.LoopMetrics:
+    _need(recording, drive)
+    values = getattr(recording, drive)
+    cycle = metrics.last_cycle(values)
+    return metrics.loop_metrics(values[cycle], recording.deflection[cycle])
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

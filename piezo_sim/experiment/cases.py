@@ -31,16 +31,23 @@ NODES = {
 
 MODES = ("open_loop", "feedforward", "feedback")
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
-EXPERIMENT_KEYS = {"title", "controller", "sample_time", "plant", "runs"}
-RUN_KEYS = {
-    "name", "duration", "sample_time", "reference", "voltage", "tip_force", "mode", "controller",
-    "plant", "temperature", "temperature_degc",
+EXPERIMENT_KEYS = {
+    "title", "controller", "sample_time", "plant", "temperature_degc", "engine", "runs",
 }  # fmt: skip
+RUN_KEYS = (EXPERIMENT_KEYS - {"title", "runs"}) | {
+    "name", "analysis", "duration", "every", "reference", "voltage", "tip_force", "mode",
+    "temperature",
+}  # fmt: skip
+NEEDED_KEYS = ("name", "duration", "sample_time", "mode")
+UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run of one finger. Times in s; reference in m."""
+    """One run of one finger. Times in s; reference in m, tip force in N.
+
+    `analysis` names the analysis of its recording; on the `engine`, every `every`-th sample is recorded.
+    """
 
     name: str
     mode: str
@@ -51,6 +58,10 @@ class Case:
     reference: Profile
     tip_force: Profile
     temperature: Mapping[str, Any]
+    experiment: str = ""
+    analysis: str = ""
+    engine: bool = False
+    every: int = 1
 
     @property
     def samples(self) -> int:
@@ -60,14 +71,20 @@ class Case:
     def parameters(self, bag: Path | None = None) -> dict[str, Any]:
         """Return the parameter dataclass of every node for this run."""
         share = params_folder()
+        grid = max(1e-3, self.sample_time)
         changes: dict[str, dict[str, Any]] = {
             "feedforward": {
                 "subscribers": 2,
                 "sample_time": self.sample_time,
                 "compensator": "static_gain" if self.mode == "open_loop" else "inverse",
             },
-            "feedback": {"subscribers": 2, "sample_time": self.sample_time},
-            "temperature": {"subscribers": 2, **self.temperature},
+            "feedback": {"subscribers": 2},
+            "temperature": {
+                "subscribers": 2,
+                "period": grid,
+                "ahead": 20 * grid,
+                **self.temperature,
+            },
             "recorder": {"bag": str(bag or "")},
             "cantilever": {
                 "subscribers": 2,
@@ -75,6 +92,8 @@ class Case:
                 "samples": self.samples,
                 "plant": self.plant,
                 "temperature_lockstep": True,
+                "temperature_period": grid,
+                "clock_period": 10 * grid,
             },
         }
         files = {
@@ -84,12 +103,18 @@ class Case:
         }
         if self.mode == "feedback":
             files["feedback"] = share / f"feedback_{self.controller}.yaml"
-            del changes["feedback"]["sample_time"]
+        else:
+            changes["feedback"]["sample_time"] = self.sample_time
         parameters = {}
         for name, kind in NODES.items():
             values = load(files[name], name) if name in files else {}
             parameters[name] = build(
                 kind, {**values, **changes[name]}, f"case '{self.name}': {name}"
+            )
+        if parameters["feedback"].sample_time != self.sample_time:
+            raise ParameterError(
+                f"case '{self.name}': 'sample_time' is {self.sample_time:g} s, must be that of controller "
+                f"'{self.controller}': {parameters['feedback'].sample_time:g} s"
             )
         return parameters
 
@@ -99,61 +124,134 @@ def params_folder() -> Path:
     return Path(get_package_share_directory("piezo_gripper")) / "params"
 
 
-def read_experiment(path: Path, overrides: Mapping[str, Any]) -> tuple[str, list[Case]]:
-    """Return title and cases of the experiment in `path`; `overrides` replace keys of every run.
+def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[Case]]:
+    """Return title and cases of the experiment `name`, a file in params/experiments.
 
-    A run with several modes or temperatures becomes a case for each combination. Raises ParameterError
-    naming file, run and key.
+    `overrides` replace keys of every run; `amplitude_um` and `amplitude_v` replace the height of the
+    reference and of the voltage, wherever a run has one. A list of modes, controllers or temperatures
+    makes a case of each combination and becomes part of its name. A file with `experiments` instead of
+    `runs` stands for the cases of all of these, its other keys being overrides for them.
+
+    Raises ParameterError naming file, run and key.
     """
+    path = params_folder() / "experiments" / f"{name}.yaml"
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError) as error:
         raise ParameterError(f"{path}: cannot be read: {error}") from None
-    unknown = set(content) - EXPERIMENT_KEYS
-    if unknown:
-        raise ParameterError(f"{path}: unknown keys {sorted(unknown)}; known: {EXPERIMENT_KEYS}")
-    common = {key: content[key] for key in ("controller", "sample_time", "plant") if key in content}
+    title = content.pop("title", name)
+    members = content.pop("experiments", None)
+    if members is not None:
+        return title, [
+            case for m in members for case in read_experiment(m, {**content, **overrides})[1]
+        ]
+    _refuse_unknown(content, EXPERIMENT_KEYS, str(path))
     cases: list[Case] = []
-    for run in content["runs"]:
-        unknown = set(run) - RUN_KEYS
-        if unknown:
-            raise ParameterError(f"{path}: run '{run.get('name')}': unknown keys {sorted(unknown)}")
-        cases += _expand({**common, **run, **overrides}, f"{path}: run '{run.get('name')}'")
-    return content["title"], cases
+    for run in content.pop("runs"):
+        where = f"{path}: run '{run.get('name')}'"
+        _refuse_unknown(run, RUN_KEYS, where)
+        cases += _expand(name, _overridden({**content, **run}, overrides), where)
+    return title, cases
 
 
-def _expand(run: dict[str, Any], where: str) -> list[Case]:
-    temperatures = run.get("temperature_degc", [None])
+def _refuse_unknown(mapping: Mapping[str, Any], known: set[str], where: str) -> None:
+    unknown = set(mapping) - known
+    if unknown:
+        raise ParameterError(f"{where}: unknown keys {sorted(unknown)}; known: {sorted(known)}")
+
+
+def _overridden(run: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    changes = dict(overrides)
+    for signal, key in (("reference", "amplitude_um"), ("voltage", "amplitude_v")):
+        height = changes.pop(key, None)
+        if height is not None and key in run.get(signal, {}):
+            run[signal] = {**run[signal], key: height}
+    if "temperature" in run and "temperature_degc" in changes:
+        first, *others = changes.pop("temperature_degc")
+        change = {"amplitude_degc": others[-1] - first} if others else {}
+        run["temperature"] = {**run["temperature"], "base_degc": first, **change}
+    return {**run, **changes}
+
+
+def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
+    for key in NEEDED_KEYS:
+        if key not in run:
+            raise ParameterError(f"{where}: key '{key}' is missing")
+    for key in ("duration", "sample_time"):
+        if not (isinstance(run[key], float) and run[key] > 0.0):
+            raise ParameterError(
+                f"{where}: '{key}' is {run[key]!r}, must be a number above 0.0 (s)"
+            )
+    if run["duration"] < 2 * run["sample_time"]:
+        raise ParameterError(
+            f"{where}: 'duration' is {run['duration']} s, needs two samples or more"
+        )
+    temperatures = [None] if "temperature" in run else run.get("temperature_degc", [22.0])
+    modes, controllers = _listed(run["mode"]), _listed(run.get("controller", "none"))
     cases = []
-    for mode, degc in itertools.product(run["mode"], temperatures):
+    for mode, controller, degc in itertools.product(modes, controllers, temperatures):
         if mode not in MODES:
             raise ParameterError(f"{where}: mode is '{mode}', must be one of {MODES}")
-        temperature = run.get("temperature") or {"profile": "constant", "base_degc": degc}
-        suffix = "" if degc is None else f"_{degc:g}degc"
+        if mode != "feedback":
+            if controller != controllers[0]:
+                continue  # without feedback, one case stands for all controllers
+            controller = "none"
+        parts = [run["name"]]
+        parts += [mode] if isinstance(run["mode"], list) else []
+        parts += [controller] if len(controllers) > 1 and mode == "feedback" else []
+        parts += [] if degc is None else [f"{degc:g}degc"]
         cases.append(
             Case(
-                name=f"{run['name']}_{mode}{suffix}",
+                experiment=experiment,
+                name="_".join(parts),
+                analysis=run.get("analysis", experiment),
                 mode=mode,
-                controller=run["controller"] if mode == "feedback" else "none",
+                controller=controller,
                 plant=run.get("plant", "prandtl_ishlinskii"),
                 sample_time=run["sample_time"],
                 duration=run["duration"],
-                reference=profile(run["reference"], "um", 1e-6, where),
-                tip_force=profile(run.get("tip_force", NO_FORCE), "mn", 1e-3, where),
-                temperature=temperature,
+                reference=_reference(run, where),
+                tip_force=profile(run.get("tip_force", NO_FORCE), "mn", where),
+                temperature=run.get("temperature") or {"profile": "constant", "base_degc": degc},
+                engine=run.get("engine", False),
+                every=run.get("every", 1),
             )
         )
     return cases
 
 
-def profile(shape: Mapping[str, Any], unit: str, scale: float, where: str) -> Profile:
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
+
+
+def _reference(run: Mapping[str, Any], where: str) -> Profile:
+    """Return the reference; one that stands for a voltage is the voltage times the static gain."""
+    if ("voltage" in run) == ("reference" in run):
+        raise ParameterError(f"{where}: needs either 'reference' or 'voltage'")
+    if "reference" in run:
+        return profile(run["reference"], "um", where)
+    if run["mode"] != "open_loop":
+        raise ParameterError(f"{where}: 'voltage' needs mode: open_loop, it is {run['mode']}")
+    voltage = profile(run["voltage"], "v", where)
+    values = load(params_folder() / "feedforward.yaml", "feedforward")
+    return Profile(voltage.time, voltage.value * values["static_gain"], voltage.linear)
+
+
+def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
     """Return the profile that a mapping like {shape: step, amplitude_um: 20.0} describes.
 
-    Shapes: `step` (at `start`), `sine` (`frequency_hz`, `periods`), `points` (`time`, `value_<unit>`,
-    joined by straight lines). Values are in `unit`, `scale` SI units each.
+    Values are in `unit` (um, v or mn), times in s. Shapes:
+
+    * `step`: to `amplitude_<unit>` at `start` (default 0);
+    * `sine`: `amplitude_<unit>`, `frequency_hz`, `periods`;
+    * `points`: `time` and `value_<unit>`, joined by straight lines;
+    * `multisine`: two periods of `period`, of about `lines` cosines with frequencies from 1 / `period` to
+      `highest_rad_s`, evenly spaced on a logarithmic axis and multiples of the lowest one; equally
+      high, with Schroeder's phases, `amplitude_<unit>` in total; a point every `spacing`.
     """
     values = dict(shape)
     kind = values.pop("shape", None)
+    scale = UNITS[unit]
     try:
         if kind == "points":
             made = Profile(
@@ -166,10 +264,35 @@ def profile(shape: Mapping[str, Any], unit: str, scale: float, where: str) -> Pr
             height, frequency = values.pop(f"amplitude_{unit}") * scale, values.pop("frequency_hz")
             time = np.linspace(0.0, values.pop("periods") / frequency, 2000)
             made = Profile(time, height * np.sin(2 * np.pi * frequency * time), True)
+        elif kind == "multisine":
+            height = values.pop(f"amplitude_{unit}") * scale
+            time, wave = multisine(
+                *(values.pop(n) for n in ("period", "highest_rad_s", "lines", "spacing"))
+            )
+            made = Profile(time, height * wave, True)
         else:
-            raise ParameterError(f"{where}: shape is {kind!r}, must be 'step', 'sine' or 'points'")
+            raise ParameterError(
+                f"{where}: shape is {kind!r}, must be 'step', 'sine', 'points' or 'multisine'"
+            )
     except KeyError as error:
         raise ParameterError(f"{where}: shape '{kind}' needs {error}") from None
+    except (TypeError, ValueError) as error:
+        raise ParameterError(f"{where}: shape '{kind}': {error}") from None
     if values:
         raise ParameterError(f"{where}: shape '{kind}' does not know {sorted(values)}")
     return made
+
+
+def multisine(
+    period: float, highest_rad_s: float, lines: int, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return two periods of a multisine of peak value 1: time (s) and value, see :func:`profile`."""
+    highest = int(highest_rad_s * period / (2.0 * np.pi))
+    order = np.unique(np.rint(np.geomspace(1, highest, lines)))
+    time = np.arange(2 * round(period / spacing)) * spacing
+    index = np.arange(order.size)
+    phase = -np.pi * index * (index - 1) / order.size
+    wave = np.sum(
+        [np.cos(2.0 * np.pi * n / period * time + p) for n, p in zip(order, phase)], axis=0
+    )
+    return time, wave / np.max(np.abs(wave))

@@ -1,71 +1,197 @@
-"""Runs a named experiment on real ROS 2 nodes: starts them, records, analyses, reports."""
+"""Runs a named experiment on real ROS 2 nodes: starts them, records, analyses, reports.
+
+Every figure is computed from the recorded bags; `analyse` and `compare` do the same for bags from anywhere.
+"""
 
 from __future__ import annotations
 
 import argparse
 import shutil
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from piezo_control.parameters import ParameterError
 from piezo_control.recording import BagError
-from piezo_sim.experiment import step
-from piezo_sim.experiment.cases import params_folder, read_experiment
+from piezo_sim.experiment import paper, results
+from piezo_sim.experiment.analysis import ANALYSES
+from piezo_sim.experiment.bags import analyse_bags, compare_bags, recordings
+from piezo_sim.experiment.cases import Case, read_experiment
 from piezo_sim.experiment.conductor import RunFailed
+from piezo_sim.experiment.engine_runner import run_on_engine
 from piezo_sim.experiment.processes import NodeDied
-from piezo_sim.experiment.report import print_table
-from piezo_sim.experiment.runner import Interrupted, run_cases
+from piezo_sim.experiment.report import Section, print_table, write_html
+from piezo_sim.experiment.runner import Interrupted, Run, run_cases
 
-EXPERIMENTS = {"step": step.conclude}
+EXPERIMENTS = {
+    "step": "step of the reference and of the temperature (Fig. 13): `make demo`",
+    "transient": "step of the voltage (Fig. 3)",
+    "creep": "step of the voltage, 300 s (Fig. 4)",
+    "hysteresis": "deflection over voltage at 1 Hz (Fig. 5)",
+    "feedforward": "deflection over reference, inverse hysteresis alone (Fig. 9)",
+    "frequency": "closed-loop magnitude, 0.1 to 1e4 rad/s (Fig. 14)",
+    "thermal": "a spotlight warms the finger while it holds",
+    "force": "a force on the tip while the finger holds",
+    "all": "all of these with two controllers, against the paper: `make paper`",
+}
+DONE, FAILED, UNUSABLE = 0, 1, 2
+WIDTH_OF_LOGS = 120
 
 
 def main() -> int:
     """Run the command line and return its exit code: 0 done, 1 failed, 2 unusable input."""
-    arguments = parse()
-    console = Console()
-    out = arguments.out or Path("out") / arguments.name
+    arguments = parser().parse_args()
+    console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_LOGS)
+    out = arguments.out or Path("out") / arguments.command
     try:
-        title, cases = read_experiment(
-            params_folder() / "experiments" / f"{arguments.name}.yaml", overrides(arguments)
-        )
-        prepare(out, arguments.overwrite)
-        columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        )  # fmt: skip
-        with Progress(*columns, console=console) as progress:
-            runs = list(run_cases(cases, out, arguments.namespace, progress))
-        for section in EXPERIMENTS[arguments.name](runs, out, title):
-            print_table(console, section)
+        arguments.run_command(arguments, out, console)
     except (ParameterError, FileExistsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
-        return 2
+        return UNUSABLE
     except (NodeDied, RunFailed, Interrupted, BagError) as error:
         print(f"experiment: {error}", file=sys.stderr)
-        return 1
-    console.print(f"report: {out / 'report.html'}")
-    return 0
+        return FAILED
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    return DONE
 
 
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="experiment", description=__doc__)
-    parser.add_argument("name", choices=EXPERIMENTS, help="which experiment")
-    parser.add_argument("--out", type=Path, help="folder for the results (default: out/NAME)")
-    parser.add_argument("--overwrite", action="store_true", help="replace earlier results in --out")
-    parser.add_argument("--namespace", default="finger", help="namespace of the nodes")
-    parser.add_argument("--controller", help="controller of the feedback cases, as in params/")
-    parser.add_argument(
+def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Run a named experiment and write metrics.json, plots and report."""
+    title, cases = read_experiment(arguments.command, overrides(arguments))
+    for case in cases:
+        case.parameters()  # refuse what cannot run before anything does
+    prepare(out, arguments.overwrite)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        runs = list(run_all(cases, out, arguments.namespace, progress))
+        runs.sort(key=lambda run: cases.index(run.case))
+        task = progress.add_task("analysis of the bags", total=len(runs))
+        found = [results.result(run) for run in progress.track(runs, task_id=task)]
+    content = results.metrics(found, out)
+    sections = results.sections(found, out)
+    if arguments.command == "all":
+        sections.insert(0, paper.section(found))
+        content["paper"] = paper.compare(found)
+    results.write_metrics(content, out)
+    write_html(out / "report.html", title, sections, results.footer(content, len(found)))
+    print_tables(console, sections)
+
+
+def run_all(cases: Sequence[Case], out: Path, namespace: str, progress: Progress) -> Iterator[Run]:
+    """Run the cases on node processes, and those meant for it on the engine."""
+    on_nodes = [case for case in cases if not case.engine]
+    if on_nodes:
+        yield from run_cases(on_nodes, out, namespace, progress)
+    for case in cases:
+        if case.engine:
+            yield run_on_engine(case, out, namespace, progress)
+
+
+def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Analyse bags one by one."""
+    found = _read_bags(arguments)
+    prepare(out, overwrite=True)
+    sections = analyse_bags(found, arguments.kind, out)
+    write_html(out / "report.html", "Analysis of recorded bags", sections)
+    print_tables(console, sections)
+
+
+def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Compare bags in one plot and one table."""
+    found = _read_bags(arguments)
+    prepare(out, overwrite=True)
+    section = compare_bags(found, arguments.kind, out)
+    write_html(out / "report.html", "Comparison of recorded bags", [section])
+    print_tables(console, [section])
+
+
+def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
+    return recordings(arguments.bags, arguments.finger, arguments.run, arguments.partial)
+
+
+def print_tables(console: Console, sections: Sequence[Section]) -> None:
+    for section in sections:
+        print_table(console, section)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    main_parser = argparse.ArgumentParser(prog="experiment", description=__doc__)
+    commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, text in EXPERIMENTS.items():
+        command = commands.add_parser(name, help=text, description=f"Experiment: {text}.")
+        command.set_defaults(run_command=run_experiment)
+        _add_experiment_options(command, name)
+    for name, text, function in (
+        ("analyse", "analyse recorded bags: each with plot and table", run_analyse),
+        ("compare", "compare recorded bags: one plot, one table, differences", run_compare),
+    ):
+        command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
+        command.set_defaults(run_command=function)
+        _add_bag_options(command, name, least="two or more" if name == "compare" else "one or more")
+    return main_parser
+
+
+def _add_experiment_options(command: argparse.ArgumentParser, name: str) -> None:
+    command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
+    command.add_argument("--overwrite", action="store_true", help="replace results in --out")
+    command.add_argument("--namespace", default="finger", help="namespace of the nodes")
+    command.add_argument(
+        "--controller", nargs="+", metavar="NAME",
+        help="controllers of the runs with feedback: params/feedback_NAME.yaml",
+    )  # fmt: skip
+    command.add_argument(
         "--plant", choices=("prandtl_ishlinskii", "truth"), help="class of the plant"
     )
-    return parser.parse_args()
+    command.add_argument(
+        "--temperature", dest="temperature_degc", type=float, nargs="+", metavar="DEGC",
+        help="constant temperatures; where one changes, the first and the last",
+    )  # fmt: skip
+    command.add_argument("--amplitude-um", type=float, help="height of the reference in µm")
+    command.add_argument("--amplitude-v", type=float, help="height of the voltage in V")
+    command.add_argument("--sample-time", type=float, help="sample time in s")
+    command.add_argument("--duration", type=float, help="length of every run in s")
+    command.add_argument(
+        "--engine", action=argparse.BooleanOptionalAction, default=None,
+        help="run all on the engine, in one process, or none (default: only what takes long)",
+    )  # fmt: skip
 
 
-def overrides(arguments: argparse.Namespace) -> dict[str, str]:
+def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) -> None:
+    command.add_argument(
+        "bags", type=Path, nargs="+", metavar="BAG",
+        help=f"{least} rosbag2 folders, or .mcap or .db3 files",
+    )  # fmt: skip
+    command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
+    command.add_argument(
+        "--as",
+        dest="kind",
+        choices=ANALYSES,
+        help="kind of experiment (default: what it looks like)",
+    )
+    command.add_argument("--finger", default="", help="namespace, when a bag holds several fingers")
+    command.add_argument("--run", type=int, help="which run, from 0, when a bag holds several")
+    command.add_argument(
+        "--partial", action="store_true", help="use what can be read of a damaged bag"
+    )
+
+
+OVERRIDES = (
+    "controller", "plant", "temperature_degc", "amplitude_um", "amplitude_v", "sample_time",
+    "duration", "engine",
+)  # fmt: skip
+
+
+def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the experiment keys given on the command line."""
-    given = {"controller": arguments.controller, "plant": arguments.plant}
-    return {key: value for key, value in given.items() if value}
+    given = {name: getattr(arguments, name) for name in OVERRIDES}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def prepare(out: Path, overwrite: bool) -> None:

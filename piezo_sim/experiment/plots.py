@@ -1,71 +1,196 @@
-"""Pictures of recordings, in the units of the paper: ms, µm, V, °C."""
+"""Pictures of recordings, in the axes of the paper: ms, µm, V, rad/s, dB.
+
+Every kind of experiment has one function; `PLOTS` lists them. Each draws panels, a mapping of a title to
+what goes in there: a mapping of a label to the recordings with this label.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
 
+from piezo_control.metrics import last_cycle  # noqa: E402
 from piezo_control.recording import Recording  # noqa: E402
+from piezo_sim.experiment.analysis import frequency_response  # noqa: E402
 
-TITLES = {
-    "open_loop": "open loop (static gain)",
-    "feedforward": "feedforward (inverse hysteresis)",
-    "feedback": "feedforward and feedback",
+Lines = Mapping[str, Sequence[Recording]]
+Panels = Mapping[str, Lines]
+
+UM, MS, MN = 1e6, 1e3, 1e3
+COOL, WARM = "tab:blue", "tab:red"
+OTHERS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:pink")
+WARM_FROM = 27.0  # °C
+DOTS_PER_INCH = 110
+
+
+def transient(panels: Panels, path: Path) -> Path:
+    """Draw deflection over time after a step of the voltage, as Fig. 3."""
+    figure, axes = _panels(panels)
+    for axis, line, recording in _lines(axes, panels):
+        axis.plot(recording.time * MS, recording.deflection * UM, lw=1, **line)
+    _finish(axes, "t [ms]", "deflection [µm]")
+    return _save(figure, path)
+
+
+def creep(panels: Panels, path: Path) -> Path:
+    """Draw deflection over minutes after a step of the voltage, as Fig. 4."""
+    figure, axes = _panels(panels)
+    for axis, line, recording in _lines(axes, panels):
+        axis.plot(recording.time, recording.deflection * UM, lw=1, **line)
+        axis.set_ylim(-5, 35)
+    _finish(axes, "t [s]", "deflection [µm]")
+    return _save(figure, path)
+
+
+def hysteresis(panels: Panels, path: Path) -> Path:
+    """Draw the last cycle of deflection over voltage, as Fig. 5."""
+    figure, axes = _panels(panels)
+    for axis, line, recording in _lines(axes, panels):
+        cycle = last_cycle(recording.voltage)
+        axis.plot(recording.voltage[cycle], recording.deflection[cycle] * UM, lw=1, **line)
+    _finish(axes, "U [V]", "deflection [µm]", "upper left")
+    return _save(figure, path)
+
+
+def feedforward(panels: Panels, path: Path) -> Path:
+    """Draw the last cycle of deflection over reference, as Fig. 9."""
+    figure, axes = _panels(panels)
+    for axis, line, recording in _lines(axes, panels):
+        cycle = last_cycle(recording.reference)
+        reference = recording.reference[cycle] * UM
+        axis.plot(reference, recording.deflection[cycle] * UM, lw=1, **line)
+    for axis in axes:
+        axis.axline((0, 0), slope=1, color="k", ls=":", lw=0.9, label="slope 1")
+    _finish(axes, "reference [µm]", "deflection [µm]", "upper left")
+    return _save(figure, path)
+
+
+def step(panels: Panels, path: Path, until: float | None = None) -> Path:
+    """Draw the response to a step of the reference up to a time (s), as Fig. 13."""
+    figure, axes = _panels(panels, sharey=True)
+    for axis, line, recording in _lines(axes, panels):
+        axis.plot(recording.time * MS, recording.deflection * UM, lw=1.2, **line)
+    for axis, lines in zip(axes, panels.values()):
+        recording = next(iter(lines.values()))[0]
+        axis.plot(recording.time * MS, recording.reference * UM, "k--", lw=0.8, label="reference")
+        axis.set_xlim(0, (until or recording.time[-1]) * MS)
+    _finish(axes, "t [ms]", "deflection [µm]", "lower right")
+    return _save(figure, path)
+
+
+def frequency(panels: Panels, path: Path) -> Path:
+    """Draw the magnitude from the reference to the deflection, as Fig. 14."""
+    figure, axes = _panels(panels, sharey=True)
+    for axis, line, recording in _lines(axes, panels):
+        response = frequency_response(recording)
+        axis.semilogx(response.frequency, response.magnitude_db, ".-", lw=1, **line)
+    for axis in axes:
+        axis.axhline(-3, color="k", ls=":", lw=0.9, label="−3 dB")
+        axis.set(xlim=(0.1, 1e4), ylim=(-18, 3))
+    _finish(axes, "frequency [rad/s]", "magnitude [dB]", "lower left")
+    return _save(figure, path)
+
+
+def thermal(panels: Panels, path: Path) -> Path:
+    """Draw temperature, change of the held deflection and voltage over time."""
+    return _disturbance(panels, path, "temperature", "temperature [°C]", 1.0)
+
+
+def force(panels: Panels, path: Path) -> Path:
+    """Draw tip force, change of the held deflection and voltage over time."""
+    return _disturbance(panels, path, "tip_force", "tip force [mN]", MN)
+
+
+PLOTS: dict[str, Callable[[Panels, Path], Path]] = {
+    plot.__name__: plot
+    for plot in (transient, creep, hysteresis, feedforward, step, frequency, thermal, force)
 }
-WARM, COOL = "tab:red", "tab:blue"
 
 
-def save(figure: plt.Figure, path: Path) -> Path:
+def _disturbance(panels: Panels, path: Path, signal: str, label: str, scale: float) -> Path:
+    count = len(panels)
+    figure, grid = plt.subplots(
+        3, count, figsize=(1.5 + 3.9 * count, 6.2), sharex=True, squeeze=False
+    )
+    for column, (title, lines) in enumerate(panels.items()):
+        upper, middle, lower = grid[:, column]
+        for _, line, recording in _lines([upper], {title: lines}):
+            values = getattr(recording, signal)
+            begin = int(np.argmax(values != values[0]))
+            shown = recording.time >= recording.time[begin] - 0.25 * np.ptp(recording.time[begin:])
+            before = recording.time < recording.time[begin]
+            held = np.mean(recording.deflection[shown & before])
+            time = recording.time[shown]
+            upper.plot(time, values[shown] * scale, lw=1, **line)
+            middle.plot(time, (recording.deflection[shown] - held) * UM, lw=0.6, **line)
+            lower.plot(time, recording.voltage[shown], lw=0.6, **line)
+        upper.set_title(title)
+        lower.set_xlabel("t [s]")
+        if len(lines) > 1:
+            upper.legend()
+    for axis, text in zip(grid[:, 0], (label, "deflection −\nvalue held [µm]", "voltage [V]")):
+        axis.set_ylabel(text)
+    for axis in grid.flat:
+        axis.grid(alpha=0.3)
+    figure.align_ylabels()
+    figure.tight_layout()
+    return _save(figure, path)
+
+
+def _panels(panels: Panels, sharey: bool = False) -> tuple[Figure, list[Axes]]:
+    """Return a figure with one panel per entry, at most three in a row."""
+    rows = math.ceil(len(panels) / 3)
+    columns = math.ceil(len(panels) / rows)
+    width = 6.0 if columns == 1 else 1.0 + 4.0 * columns
+    figure, grid = plt.subplots(
+        rows, columns, figsize=(width, 3.9 * rows), sharey=sharey, squeeze=False
+    )
+    for axis, title in zip(grid.flat, panels):
+        axis.set_title(title)
+    for spare in grid.flat[len(panels) :]:
+        spare.remove()
+    return figure, list(grid.flat[: len(panels)])
+
+
+def _lines(
+    axes: Sequence[Axes], panels: Panels
+) -> Iterator[tuple[Axes, dict[str, str], Recording]]:
+    """Yield axis, colour and legend entry, and recording of every line.
+
+    Cool fingers are blue and warm ones red where that tells the lines of a panel apart.
+    """
+    for axis, lines in zip(axes, panels.values()):
+        first = [recordings[0].temperature[0] for recordings in lines.values()]
+        colours = [WARM if degc >= WARM_FROM else COOL for degc in first]
+        if len(set(colours)) < len(colours):
+            colours = [OTHERS[i % len(OTHERS)] for i in range(len(lines))]
+        for colour, (label, recordings) in zip(colours, lines.items()):
+            for i, recording in enumerate(recordings):
+                yield axis, {"color": colour, "label": "" if i else label}, recording
+
+
+def _finish(axes: Sequence[Axes], x: str, y: str, legend: str = "best") -> None:
+    for axis in axes:
+        axis.set_xlabel(x)
+        axis.grid(alpha=0.3)
+        axis.legend(loc=legend)
+        if axis.get_subplotspec().is_first_col():
+            axis.set_ylabel(y)
+    axes[0].figure.tight_layout()
+
+
+def _save(figure: Figure, path: Path) -> Path:
     """Write the figure as PNG and free it."""
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    figure.savefig(path, dpi=DOTS_PER_INCH)
     plt.close(figure)
     return path
-
-
-def temperature_colour(recording: Recording) -> str:
-    """Return blue for a cool finger and red for a warm one, as all figures have it."""
-    return COOL if recording.temperature[0] < 27.0 else WARM
-
-
-def steps(runs: Mapping[str, Mapping[str, Recording]], path: Path) -> Path:
-    """Draw step responses, one panel per mode, one line per recording (mode to label to recording)."""
-    figure, axes = plt.subplots(1, len(runs), figsize=(4.2 * len(runs), 3.6), sharey=True)
-    for axis, (mode, recordings) in zip(axes, runs.items()):
-        for label, recording in recordings.items():
-            colour = temperature_colour(recording)
-            axis.plot(recording.time * 1e3, recording.deflection * 1e6, colour, lw=1, label=label)
-        axis.plot(recording.time * 1e3, recording.reference * 1e6, "k--", lw=0.8, label="reference")
-        axis.set(title=TITLES[mode], xlabel="t [ms]")
-        axis.grid(alpha=0.3)
-    axes[0].set_ylabel("deflection [µm]")
-    axes[-1].legend(loc="lower right")
-    return save(figure, path)
-
-
-def disturbance(recording: Recording, path: Path) -> Path:
-    """Draw temperature, deflection error and voltage of a finger that holds its reference."""
-    figure, axes = plt.subplots(3, 1, figsize=(8, 6), sharex=True)
-    error = (recording.deflection - recording.reference) * 1e6
-    held = recording.time > 0.1
-    signals = (
-        (recording.time, recording.temperature, "temperature [°C]"),
-        (recording.time[held], error[held], "deflection − reference [µm]"),
-        (recording.time, recording.voltage, "voltage [V]"),
-    )
-    for axis, (time, value, label) in zip(axes, signals):
-        _line(axis, time, value, label)
-    axes[-1].set_xlabel("t [s]")
-    return save(figure, path)
-
-
-def _line(axis: Axes, time: object, value: object, label: str) -> None:
-    axis.plot(time, value, lw=0.9)
-    axis.set_ylabel(label)
-    axis.grid(alpha=0.3)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader
+from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -25,9 +27,9 @@ class Section:
 
 def write_html(path: Path, title: str, sections: Iterable[Section], footer: str = "") -> None:
     """Write `sections` as one HTML file with the pictures inside."""
-    template = Environment(
-        loader=PackageLoader("piezo_sim.experiment", "."), autoescape=True
-    ).get_template("report.html.j2")
+    environment = Environment(loader=PackageLoader("piezo_sim.experiment", "."), autoescape=True)
+    environment.filters["is_text"] = lambda cell: not re.match(r"[-+–0-9]", cell)
+    template = environment.get_template("report.html.j2")
     pages = [
         {
             "title": section.title,
@@ -46,9 +48,10 @@ def write_html(path: Path, title: str, sections: Iterable[Section], footer: str 
 
 def print_table(console: Console, section: Section) -> None:
     """Print the section's table on the terminal."""
-    table = Table(title=section.title)
+    table = Table(title=section.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in section.columns:
-        table.add_column(column, justify="left" if column == section.columns[0] else "right")
+        is_first = column == section.columns[0]
+        table.add_column(column, justify="left" if is_first else "right", overflow="fold")
     for row in section.rows:
         table.add_row(*row)
     console.print(table)
