@@ -76,25 +76,13 @@ class FitQuality:
         return 100.0 * self.maximum / self.stroke
 
 
-def assess(
-    model: HysteresisModel,
-    measurement: Measurement,
-    samples: slice = slice(None),
-    own_offset: bool = False,
-) -> FitQuality:
-    """Compare the model with `samples` of a measurement; the plays start at 0 at its beginning.
-
-    `own_offset` takes the sensor's zero from these samples, as for another measurement.
-    """
-    deviation = (measurement.deflection - model.deflection(measurement.time, measurement.voltage))[
-        samples
-    ]
-    if own_offset:
-        deviation = deviation - deviation.mean()
+def quality(measured: NDArray[np.float64], modelled: NDArray[np.float64]) -> FitQuality:
+    """Compare two histories of deflection (m)."""
+    deviation = measured - modelled
     return FitQuality(
         float(np.sqrt(np.mean(deviation**2))),
         float(np.abs(deviation).max()),
-        float(np.ptp(measurement.deflection[samples])),
+        float(np.ptp(measured)),
     )
 
 
@@ -137,9 +125,19 @@ def identify_hysteresis(
     Raises
     ------
     MeasurementError
-        If voltage or deflection is constant or too little is left to fit.
+        If voltage or deflection is constant, a threshold lies beyond the voltages or too little is left
+        to fit.
+    ParameterError
+        If the thresholds do not increase from 0.
     """
     measurement.need_varying("voltage", "deflection")
+    HysteresisParameters(tuple(thresholds), (1.0,) * len(thresholds))  # refuses unusable thresholds
+    half_range = 0.5 * float(np.ptp(measurement.voltage))
+    if thresholds[-1] >= half_range:
+        raise MeasurementError(
+            f"{measurement.source}: threshold {thresholds[-1]:g} V never comes into play, must be "
+            f"below half the range of the voltage, {half_range:g} V"
+        )
     first = settled(measurement) if first is None else first
     last = len(measurement.time) if last is None else last
     unknowns = len(thresholds) + 2 * dead_zones + 2

@@ -108,16 +108,21 @@ def read_measurement(
     columns: Mapping[str, str] | None = None,
     sample_time: float | None = None,
     finger: str = "",
+    run: int | None = None,
     sensor_delay: int = 1,
 ) -> Measurement:
-    """Read a rosbag2 folder (`finger`, `sensor_delay`) or a text file (`columns`, `sample_time`).
+    """Read a bag (`finger`, `run`, `sensor_delay`) or a text file (`columns`, `sample_time`).
 
     Raises MeasurementError, naming file, column and row, when it cannot be used.
     """
-    path = Path(path)
-    if path.is_dir():
-        return read_bag(path, finger, sensor_delay)
+    if is_bag(path):
+        return read_bag(path, finger, run, sensor_delay)
     return read_text(path, columns or {}, sample_time)
+
+
+def is_bag(path: str | Path) -> bool:
+    """Tell a rosbag2 folder or storage file from a text file."""
+    return Path(path).is_dir() or Path(path).suffix in (".mcap", ".db3")
 
 
 def read_text(
@@ -219,17 +224,20 @@ def _column(
     return values
 
 
-def read_bag(path: str | Path, finger: str = "", sensor_delay: int = 1) -> Measurement:
-    """Read the run of one finger from a rosbag2 folder.
+def read_bag(
+    path: str | Path, finger: str = "", run: int | None = None, sensor_delay: int = 1
+) -> Measurement:
+    """Read one run of one finger from a rosbag2 folder.
 
     Parameters
     ----------
-    path : path of the folder
-    finger : finger of the finger, needed when the bag has several
+    path : path of the folder, or of its storage file
+    finger : namespace of the finger, needed when the bag has several
+    run : which run, from 0, of a bag in which the sample numbers start again
     sensor_delay : age of a deflection (samples) when the cantilever publishes it
     """
     try:
-        run = recording.read(path, finger)
+        recorded = recording.read(path, finger, run)
     except recording.BagError as error:
         raise MeasurementError(str(error)) from None
     before = 1 + sensor_delay
@@ -237,17 +245,21 @@ def read_bag(path: str | Path, finger: str = "", sensor_delay: int = 1) -> Measu
     def earlier(values: NDArray, at_start: float) -> NDArray:
         return np.concatenate((np.full(before, at_start), values))[: len(values)]
 
-    def if_recorded(values: NDArray) -> NDArray | None:
-        return None if np.isnan(values).all() else earlier(values, values[0])
+    def since_sent(values: NDArray, until_then: float | None = None) -> NDArray | None:
+        sent = np.flatnonzero(~np.isnan(values))
+        if not len(sent):
+            return None
+        start = values[sent[0]] if until_then is None else until_then
+        return earlier(np.concatenate((np.full(sent[0], start), values[sent[0] :])), start)
 
     measurement = Measurement(
         str(path),
-        run.time,
-        earlier(run.voltage, 0.0),
-        run.deflection,
-        if_recorded(run.temperature),
-        if_recorded(run.tip_force),
-        np.arange(len(run.time)),
+        (recorded.number - recorded.number[0]) * recorded.sample_time,
+        earlier(recorded.voltage, 0.0),
+        recorded.deflection,
+        since_sent(recorded.temperature),
+        since_sent(recorded.tip_force, until_then=0.0),
+        recorded.number,
     )
     measurement.need_even_sampling()
     return measurement

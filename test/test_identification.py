@@ -1,0 +1,160 @@
+"""Hysteresis from recordings: known weights come back, and a measured actuator is described."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from piezo_control.excitation import decaying_sine
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.hysteresis import HysteresisParameters, deflection_history
+from piezo_control.identification import (
+    equal_thresholds,
+    identify_hysteresis,
+    quality,
+    settled,
+)
+from piezo_control.measurement import Measurement, MeasurementError, read_measurement
+from piezo_control.parameters import ParameterError
+from piezo_sim.cantilever import Cantilever, CantileverParameters
+
+P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"
+SETTLED = slice(400, None)
+
+
+def recorded(parameters, sample_time, lag=0.0, offset=0.0):
+    """A decaying excitation seen by the paper's sensor: 10 nm steps and 5 nm of noise."""
+    profile = decaying_sine(40.0, cycles=20)
+    time = np.arange(0.0, profile.time[-1], sample_time)
+    deflection = deflection_history(parameters, profile.at(time - lag)) + offset
+    noise = 5e-9 * np.random.default_rng(5).standard_normal(len(time))
+    readings = 10e-9 * np.round((deflection + noise) / 10e-9)
+    return Measurement("sim", time, profile.at(time), readings, None, None, np.arange(len(time)))
+
+
+@pytest.fixture(scope="module")
+def p885():
+    return read_measurement(P885, {"voltage": "0", "deflection": "4:um"}, sample_time=0.005)
+
+
+def fit_percent(model, measurement, samples):
+    modelled = model.deflection(measurement.time, measurement.voltage)
+    return quality(measurement.deflection[samples], modelled[samples]).rms_percent
+
+
+def test_weights_come_back_within_1_percent():
+    truth = HysteresisParameters()
+    model = identify_hysteresis(recorded(truth, 1e-3), truth.thresholds, lag=0.0)
+    np.testing.assert_allclose(model.parameters.weights, truth.weights, rtol=0.01)
+    assert abs(model.offset) < 5e-9
+
+
+def test_lag_and_offset_are_told_from_the_hysteresis():
+    truth = HysteresisParameters()
+    measurement = recorded(truth, 1e-3, lag=8e-3, offset=-120e-6)
+    model = identify_hysteresis(measurement, truth.thresholds)
+    assert model.lag == pytest.approx(8e-3, abs=0.2e-3)
+    assert model.offset == pytest.approx(-120e-6, abs=20e-9)
+    np.testing.assert_allclose(model.parameters.weights[:6], truth.weights[:6], rtol=0.1)
+
+
+def test_no_lag_is_found_where_there_is_none():
+    truth = HysteresisParameters()
+    assert identify_hysteresis(recorded(truth, 1e-3), truth.thresholds).lag == 0.0
+
+
+def test_dead_zones_come_back_where_the_fit_has_its_knots():
+    """One on either side: the fit bends a quarter of the stroke from the middle, a = (e + p (e - a)) / 2."""
+    end, change = 22e-6, 0.2
+    knot = (1.0 + change) / (2.0 + change) * end
+    truth = HysteresisParameters(
+        upper_thresholds=(knot,), upper_weights=(change,),
+        lower_thresholds=(knot,), lower_weights=(change,),
+    )  # fmt: skip
+    measurement = recorded(truth, 1e-3)
+    fit = identify_hysteresis(measurement, truth.thresholds, dead_zones=1, lag=0.0, first=0)
+    model = fit.parameters
+    np.testing.assert_allclose([model.upper_thresholds, model.lower_thresholds], knot, rtol=0.01)
+    np.testing.assert_allclose([model.upper_weights, model.lower_weights], change, rtol=0.02)
+
+
+def test_measured_actuator_classical(p885):
+    model = identify_hysteresis(p885, equal_thresholds(p885, 10), first=400)
+    assert fit_percent(model, p885, SETTLED) <= 0.90
+
+
+def test_measured_actuator_modified(p885):
+    model = identify_hysteresis(p885, equal_thresholds(p885, 20), dead_zones=3, first=400)
+    assert fit_percent(model, p885, SETTLED) <= 0.50
+    assert model.lag == pytest.approx(0.018, abs=0.002)  # the turning points lag by 3 to 4 rows
+
+
+@pytest.mark.parametrize("dead_zones", [0, 3])
+def test_measured_actuator_held_back(p885, dead_zones):
+    """Fitted on the first 60 % of the cycles, judged on the rest with the offset of the first."""
+    split = 400 + 23 * 200
+    thresholds = equal_thresholds(p885, 20)
+    model = identify_hysteresis(p885, thresholds, dead_zones, first=400, last=split)
+    assert fit_percent(model, p885, slice(split, None)) <= (0.95 if dead_zones == 0 else 0.7)
+
+
+def test_feedforward_identified_from_a_plant_of_another_class():
+    """Excite the Bouc-Wen plant, identify, invert: 1 Hz, +-20 um within 2.5 % of the stroke."""
+    sample_time, delay = 2e-3, 1
+
+    def finger():
+        return Cantilever(CantileverParameters(plant="truth", sample_time=sample_time))
+
+    def tracked(law):
+        plant = finger()
+        deflection = []
+        for command in reference.tolist():
+            plant.advance(law.step(command), 22.0)
+            deflection.append(plant.deflection)
+        error = np.abs(np.array(deflection) - reference)
+        return 100.0 * error[error.size // 3 :].max() / 40e-6  # after the first of three cycles
+
+    plant, deflection = finger(), []
+    time = np.arange(0.0, 20.0, sample_time)
+    voltage = decaying_sine(40.0, cycles=20).at(time)
+    for v in voltage.tolist():
+        deflection.append(plant.measure())
+        plant.advance(v, 22.0)
+    seen = np.concatenate((np.zeros(1 + delay), voltage))[: len(time)]
+    measurement = Measurement(
+        "truth", time, seen, np.array(deflection), None, None, np.arange(len(time))
+    )
+    model = identify_hysteresis(measurement, equal_thresholds(measurement, 20), 3, lag=0.0)
+
+    reference = 20e-6 * np.sin(2.0 * np.pi * np.arange(0.0, 3.0, sample_time))
+    inverse = FeedforwardParameters(hysteresis=model.parameters, voltage_limit=45.0)
+    straight = FeedforwardParameters(
+        compensator="static_gain", static_gain=np.ptp(deflection) / 80.0, voltage_limit=45.0
+    )
+    assert tracked(Feedforward(inverse, sample_time)) <= 2.5
+    assert tracked(Feedforward(straight, sample_time)) > 7.0
+
+
+def test_fit_begins_where_the_plays_are_known():
+    time = np.arange(400) * 0.01
+    voltage = 10.0 * np.sin(2.0 * np.pi * time)
+    measurement = Measurement("sine", time, voltage, voltage, None, None, np.arange(400))
+    assert settled(measurement) == pytest.approx(75, abs=3)  # three quarters of the first cycle
+
+
+@pytest.mark.parametrize(
+    ("thresholds", "error", "message"),
+    [
+        ((0.0, 1.0, 2.0), MeasurementError, "threshold 2 V never comes into play"),
+        ((0.0, 1.0, 1.0), ParameterError, r"'thresholds\[2\]'"),
+        ((0.5, 1.0), ParameterError, "must start with 0.0 V"),
+    ],
+)
+def test_unusable_thresholds_are_refused(p885, thresholds, error, message):
+    with pytest.raises(error, match=message):
+        identify_hysteresis(p885, thresholds)
+
+
+def test_too_little_data_is_refused(p885):
+    with pytest.raises(MeasurementError, match="100 samples are left to fit 22 numbers"):
+        identify_hysteresis(p885, equal_thresholds(p885, 20), first=400, last=500)
