@@ -67,7 +67,7 @@ install_pins() {
   mkdir -p log
   if ! .venv/bin/python -m pip install --no-input --disable-pip-version-check --no-deps \
       --requirement "requirements/$underlay.txt" > "$log" 2>&1; then
-    if grep -qE 'Retrying|Connection|resolve' "$log"; then
+    if grep -qE 'Retrying|from versions: none' "$log"; then
       fail "no package registry reachable: check the network, or pip's index-url and proxy (see $log)"
     fi
     fail "pip failed: $(grep -m 1 '^ERROR' "$log" || echo 'no message') (see $log)"
