@@ -27,6 +27,7 @@ from piezo_control.measurement import Measurement, MeasurementError
 REFERENCE_DEGC = 22.0
 ROWS = 3000  # per recording, of block means: vibration and noise average out
 RELAXATIONS = 3
+JUMP = 0.1  # of the static range, from block to block: such blocks ring and are not fitted
 SMALLEST_WARMING = 1.0  # degC, to tell what depends on temperature
 
 
@@ -73,6 +74,8 @@ class _Means:
         self.voltage = means(measurement.voltage)
         self.static = means(deflection_history(hysteresis, measurement.voltage))
         self.temperature = means(measurement.temperature)
+        jumps = np.abs(np.diff(self.static, prepend=self.static[0])) > JUMP * np.ptp(self.static)
+        self.kept = ~(jumps | np.roll(jumps, 1))
 
     def relax(self, values: NDArray, time_constant: float, start: float) -> NDArray:
         """Return `values`, held over each block, behind a first-order lag from `start`."""
@@ -109,7 +112,7 @@ def identify_drift(
     spans_temperatures = warmest - coldest >= SMALLEST_WARMING and warmest > 0.0
     longest = max(float(r.time[-1]) for r in recordings)
     shortest = max(r.step for r in recordings)
-    measured = np.concatenate([r.deflection for r in recordings])
+    measured = np.concatenate([r.deflection[r.kept] for r in recordings])
     scale = float(np.std(measured))
 
     def regressors(logs: NDArray, cold_share: float) -> NDArray:
@@ -127,7 +130,7 @@ def identify_drift(
             columns.append(r.static)
             offsets = np.zeros((len(body), len(recordings)))
             offsets[:, number] = 1.0
-            blocks.append(np.column_stack((*columns, offsets)))
+            blocks.append(np.column_stack((*columns, offsets))[r.kept])
         return np.concatenate(blocks)
 
     lowest = np.full(RELAXATIONS + 3 + len(recordings), -np.inf)
@@ -157,7 +160,7 @@ def identify_drift(
         cold_share, warmest = 1.0, 1.0
     order = np.argsort(times)
     shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
-    ends = np.cumsum([len(r.time) for r in recordings])[:-1]
+    ends = np.cumsum([np.sum(r.kept) for r in recordings])[:-1]
     modelled = np.split(measured - deviation, ends)
     return DriftModel(
         creep_gain=total * cold_share,
@@ -168,6 +171,7 @@ def identify_drift(
         time_constant=time_constant if warming else 0.0,
         gain_per_degc=float(x[RELAXATIONS + 1] / x[RELAXATIONS + 2]) if warming else 0.0,
         fitted=tuple(
-            np.column_stack((r.time, r.deflection, m)) for r, m in zip(recordings, modelled)
+            np.column_stack((r.time[r.kept], r.deflection[r.kept], m))
+            for r, m in zip(recordings, modelled)
         ),
     )

@@ -66,11 +66,13 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     thresholds = arguments.thresholds or equal_thresholds(measurement, arguments.plays)
     dead_zones = arguments.dead_zones if arguments.model == "modified" else 0
     lag = arguments.lag
-    if lag is None and is_bag(arguments.recording):
-        lag = 0.0  # the delay of a bag's deflections is known and taken account of
+    if lag is None:  # the delay of a bag's deflections is known and taken account of
+        lag = 0.0 if is_bag(arguments.recording) else "identify"
 
     def fit(end: int) -> HysteresisModel:
-        return identify_hysteresis(measurement, thresholds, dead_zones, lag, first, end)
+        return identify_hysteresis(
+            measurement, thresholds, dead_zones, None if lag == "identify" else lag, first, end
+        )
 
     def judge(model: HysteresisModel, samples: slice) -> FitQuality:
         modelled = model.deflection(measurement.time, measurement.voltage)
@@ -352,8 +354,8 @@ def parse() -> argparse.Namespace:
     fit.add_argument("--thresholds", type=volts, metavar="V,V,...", help="thresholds instead")
     fit.add_argument("--dead-zones", type=int, default=3, metavar="N", help="on either side (3)")
     fit.add_argument(
-        "--lag", type=float, metavar="S",
-        help="lag of the deflection; default: 0 for bags, identified for text files",
+        "--lag", type=seconds, metavar="S",
+        help="lag of the deflection, or 'identify'; default: 0 for bags, 'identify' for text files",
     )  # fmt: skip
     fit.add_argument(
         "--skip", type=int, metavar="SAMPLES",
@@ -375,6 +377,11 @@ def share(text: str) -> float:
     if not 0.0 <= value <= 0.9:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 0.9")
     return value
+
+
+def seconds(text: str) -> float | str:
+    """Return a number of seconds, or the word 'identify'."""
+    return text if text == "identify" else float(text)
 
 
 def volts(text: str) -> tuple[float, ...]:

@@ -1,0 +1,81 @@
+"""Creep and thermal deflection from the engine's long recordings at two temperatures."""
+
+import numpy as np
+import pytest
+
+from piezo_control.drift_identification import identify_drift
+from piezo_control.hysteresis import HysteresisParameters
+from piezo_control.measurement import Measurement, MeasurementError
+from piezo_control.profile import Profile
+from piezo_sim.cantilever import CantileverParameters
+from piezo_sim.engine import drive
+from piezo_sim.temperature import TemperatureParameters
+
+SAMPLE_TIME = 1e-2
+PLANT = CantileverParameters(sample_time=SAMPLE_TIME)
+
+
+def measured(voltage, temperatures, duration):
+    run = drive(PLANT, temperatures, voltage, round(duration / SAMPLE_TIME))
+
+    def before(values, start):
+        return np.concatenate(([start] * 2, values))[: len(values)]
+
+    return Measurement(
+        "sim",
+        run.time,
+        before(run.voltage, 0.0),
+        run.deflection,
+        before(run.temperature, run.temperature[0]),
+        None,
+        run.number,
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings():
+    """Fig. 4 at both temperatures, and a warm-up by 10 °C at 0 V."""
+    step = Profile([0.0, 1.0], [0.0, 40.0])
+    constant = [TemperatureParameters(profile="constant", base_degc=t) for t in (22.0, 32.0)]
+    warming = TemperatureParameters(profile="step", base_degc=22.0, amplitude_degc=10.0, start=2.0)
+    zero = Profile([0.0], [0.0])
+    return [*(measured(step, c, 300.0) for c in constant), measured(zero, warming, 20.0)]
+
+
+def test_creep_and_thermal_terms_come_back(recordings):
+    model = identify_drift(recordings, PLANT.hysteresis)
+    creep, thermal = PLANT.creep, PLANT.thermal
+    assert model.sensitivity == pytest.approx(thermal.sensitivity, rel=0.01)
+    assert model.time_constant == pytest.approx(thermal.time_constant, rel=0.02)
+    time = np.array([1.0, 10.0, 100.0, 290.0])
+    rise = 1.0 - np.exp(-time[:, None] / np.array(creep.times))
+    for warmth, tolerance in ((0.0, 0.02e-6), (10.0, 0.2e-6)):
+        gain = creep.gain + creep.gain_per_degc * warmth
+        expected = gain * 40.0 * rise @ np.array(creep.shares)
+        found = model.creep_after_step(time, 40.0, 22.0 + warmth)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
+    assert sum(model.creep_shares) == pytest.approx(1.0)
+
+
+def test_fit_describes_the_recordings(recordings):
+    for curve in identify_drift(recordings, PLANT.hysteresis).fitted:
+        _, measured, modelled = curve.T
+        assert np.sqrt(np.mean((measured - modelled) ** 2)) < 20e-9
+
+
+def test_at_one_temperature_creep_is_found_without_its_temperature_dependence(recordings):
+    model = identify_drift(recordings[:1], PLANT.hysteresis)
+    assert model.creep_gain_per_degc == 0.0
+    assert model.sensitivity == 0.0
+    final = model.creep_after_step(np.array([1e4]), 40.0, 22.0)[0]
+    assert final == pytest.approx(PLANT.creep.gain * 40.0, rel=0.1)
+
+
+def test_unusable_recordings_are_refused(recordings):
+    rest = recordings[2].part(slice(0, 150))
+    with pytest.raises(MeasurementError, match="voltage and temperature are constant"):
+        identify_drift([rest], HysteresisParameters())
+    time = np.arange(100.0)
+    cold = Measurement("a.csv", time, time, time, None, None, np.arange(100))
+    with pytest.raises(MeasurementError, match="a.csv: no column 'temperature'"):
+        identify_drift([cold], HysteresisParameters())

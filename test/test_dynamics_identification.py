@@ -1,0 +1,94 @@
+"""D(s) and the elastic constant from the simulated finger, seen through its sensor."""
+
+import math
+
+import numpy as np
+import pytest
+
+from piezo_control.dynamics_identification import identify_dynamics
+from piezo_control.hysteresis import HysteresisParameters, deflection_history
+from piezo_control.measurement import Measurement, MeasurementError
+from piezo_sim.cantilever import Cantilever, CantileverParameters
+
+SAMPLE_TIME = 1e-4
+# D(s) of the paper: 5.7e-8 s^2 + 8.1e-6 s + 1
+FREQUENCY = 1.0 / math.sqrt(5.7e-8)
+DAMPING = 8.1e-6 / (2.0 * math.sqrt(5.7e-8))
+
+
+def measured(voltage, tip_force):
+    """The default finger: 10 nm steps, 5 nm noise, one sample of delay, creep."""
+    plant = Cantilever(CantileverParameters(sample_time=SAMPLE_TIME))
+    deflection = []
+    for v, force in zip(voltage.tolist(), tip_force.tolist()):
+        deflection.append(plant.measure())
+        plant.advance(v, 22.0, force)
+    count = len(voltage)
+
+    def before(values):
+        return np.concatenate((np.zeros(2), values))[:count]
+
+    time = np.arange(count) * SAMPLE_TIME
+    return Measurement(
+        "sim",
+        time,
+        before(voltage),
+        np.array(deflection),
+        None,
+        before(tip_force),
+        np.arange(count),
+    )
+
+
+def step(amplitude, samples):
+    return np.where(np.arange(samples) < 20, 0.0, amplitude)
+
+
+def test_step_of_the_voltage_as_in_figure_3():
+    """80 ms at 40 V: frequency to 0.5 %, damping to 10 %."""
+    measurement = measured(step(40.0, 800), np.zeros(800))
+    model = identify_dynamics(measurement, measurement.voltage)
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
+    assert model.damping_ratio == pytest.approx(DAMPING, rel=0.1)
+    assert model.gain == pytest.approx(22e-6 / 40.0, rel=0.01)
+    np.testing.assert_allclose(model.denominator, (5.7e-8, 8.1e-6, 1.0), rtol=0.1)
+
+
+def test_sweep_behind_the_hysteresis():
+    time = np.arange(0.0, 0.5, SAMPLE_TIME)
+    sweep = 5.0 * np.sin(2.0 * np.pi * (300.0 * time + 0.5 * 1400.0 * time**2))
+    measurement = measured(sweep, np.zeros(len(time)))
+    static = deflection_history(HysteresisParameters(), measurement.voltage)
+    model = identify_dynamics(measurement, static)
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
+    assert model.damping_ratio == pytest.approx(DAMPING, rel=0.1)
+    assert model.gain == pytest.approx(1.0, rel=0.01)
+
+
+def test_step_of_the_force_gives_the_elastic_constant():
+    measurement = measured(np.zeros(1000), step(1e-3, 1000))
+    model = identify_dynamics(measurement, measurement.tip_force)
+    assert model.gain == pytest.approx(CantileverParameters().dynamics.elastic_constant, rel=0.005)
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
+
+
+def test_model_reproduces_an_analytic_step_response():
+    """y = 1 - exp(-z w t) (cos w_d t + z w / w_d sin w_d t), exact at the samples."""
+    frequency, damping = 300.0, 0.1
+    time = np.arange(0.0, 0.1, 1e-3)
+    damped = frequency * math.sqrt(1.0 - damping**2)
+    decay = np.exp(-damping * frequency * time)
+    ratio = damping * frequency / damped
+    exact = 1e-6 * (1.0 - decay * (np.cos(damped * time) + ratio * np.sin(damped * time)))
+    drive = np.concatenate(([0.0], np.ones(len(time) - 1)))  # held before its sample
+    measurement = Measurement("step", time, drive, exact, None, None, np.arange(len(time)))
+    model = identify_dynamics(measurement, drive)
+    assert model.natural_frequency == pytest.approx(frequency, rel=1e-6)
+    assert model.damping_ratio == pytest.approx(damping, rel=1e-6)
+    np.testing.assert_allclose(model.deflection(time, drive), exact, rtol=0, atol=1e-12)
+
+
+def test_constant_drive_is_refused():
+    measurement = measured(step(40.0, 200), np.zeros(200))
+    with pytest.raises(MeasurementError, match="the drive is constant"):
+        identify_dynamics(measurement, np.ones(200))
