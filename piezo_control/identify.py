@@ -50,7 +50,7 @@ def main() -> int:
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
         for written in arguments.run(arguments, console):
-            console.print(f"wrote {written}")
+            console.print(f"wrote {written}", soft_wrap=True)
     except (MeasurementError, ParameterError, OSError) as error:
         print(f"identify: {error}", file=sys.stderr)
         return 2
@@ -66,8 +66,10 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     thresholds = arguments.thresholds or equal_thresholds(measurement, arguments.plays)
     dead_zones = arguments.dead_zones if arguments.model == "modified" else 0
     lag = arguments.lag
-    if lag is None:  # the delay of a bag's deflections is known and taken account of
-        lag = 0.0 if is_bag(arguments.recording) else "identify"
+    if lag is None:
+        # The delay of a bag's deflections is known. A voltage held before its deflection counts there as
+        # if reached at the end, but the finger smooths the steps: it is half a sample ahead of that.
+        lag = -0.5 * measurement.sample_time if is_bag(arguments.recording) else "identify"
 
     def fit(end: int) -> HysteresisModel:
         return identify_hysteresis(
@@ -355,7 +357,7 @@ def parse() -> argparse.Namespace:
     fit.add_argument("--dead-zones", type=int, default=3, metavar="N", help="on either side (3)")
     fit.add_argument(
         "--lag", type=seconds, metavar="S",
-        help="lag of the deflection, or 'identify'; default: 0 for bags, 'identify' for text files",
+        help="lag of the deflection, or 'identify'; default: known of bags, 'identify' for text files",
     )  # fmt: skip
     fit.add_argument(
         "--skip", type=int, metavar="SAMPLES",

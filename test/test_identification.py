@@ -17,6 +17,9 @@ from piezo_control.identification import (
 from piezo_control.measurement import Measurement, MeasurementError, read_measurement
 from piezo_control.parameters import ParameterError
 from piezo_sim.cantilever import Cantilever, CantileverParameters
+from piezo_sim.creep import CreepParameters
+from piezo_sim.engine import drive
+from piezo_sim.temperature import TemperatureParameters
 
 P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"
 SETTLED = slice(400, None)
@@ -47,6 +50,21 @@ def test_weights_come_back_within_1_percent():
     model = identify_hysteresis(recorded(truth, 1e-3), truth.thresholds, lag=0.0)
     np.testing.assert_allclose(model.parameters.weights, truth.weights, rtol=0.01)
     assert abs(model.offset) < 5e-9
+
+
+def test_weights_come_back_from_a_vibrating_finger():
+    """The whole finger but its creep: resonance, sensor delay, noise and 10 nm steps, at 10 kHz.
+
+    The resonance smooths the held voltages, so the deflection is half a sample ahead of the pairing.
+    """
+    plant = CantileverParameters(creep=CreepParameters(gain=0.0))
+    constant = TemperatureParameters(profile="constant", base_degc=22.0)
+    run = drive(plant, constant, decaying_sine(40.0, cycles=20), 200_000)
+    voltage = np.concatenate(([0.0, 0.0], run.voltage))[: len(run.time)]
+    measurement = Measurement("sim", run.time, voltage, run.deflection, None, None, run.number)
+    lag = -0.5 * plant.sample_time
+    model = identify_hysteresis(measurement, plant.hysteresis.thresholds, lag=lag)
+    np.testing.assert_allclose(model.parameters.weights, plant.hysteresis.weights, rtol=0.01)
 
 
 def test_lag_and_offset_are_told_from_the_hysteresis():
