@@ -19,6 +19,7 @@ W_i = w_0 + ... + w_i::
 It exists if and only if every W_i > 0 (and likewise on each side of the dead zones). A common
 growth b |du/dt| of r_1 ... r_n leaves the order in which plays move untouched, so the inverse stays
 exact with r'_i growing by w_0 b |du/dt|; this needs gaps r_{i+1} - r_i that never shrink for i >= 1.
+It is stable, too, while b/T |1 - w_0/W_i| < 1 at the sample time T.
 The states must belong to a history: abs(z_{i+1} - z_i) <= r_{i+1} - r_i.
 
 Sources: H. Janocha, K. Kuhnen, Sensors and Actuators A 79 (2000) 83 (inverse); K. Kuhnen, European
