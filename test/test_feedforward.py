@@ -96,10 +96,9 @@ def test_commands_that_are_no_number_change_nothing(command):
 
 
 def test_shipped_parameters_are_the_defaults():
-    values = load("params/feedforward.yaml", "feedforward")
-    assert (
-        build(FeedforwardParameters, values, "params/feedforward.yaml") == FeedforwardParameters()
-    )
+    shipped = Path(__file__).parents[1] / "params" / "feedforward.yaml"
+    values = load(shipped, "feedforward")
+    assert build(FeedforwardParameters, values, str(shipped)) == FeedforwardParameters()
 
 
 def test_refusal_names_file_and_index():
