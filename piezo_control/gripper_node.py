@@ -295,8 +295,11 @@ class GripperNode(FingerNode):
             return result
 
         self.server.notify_execute(handle, conclude)
-        log = self.get_logger().info if outcome.success else self.get_logger().warning
-        log(f"goal {handle.request.opening * 1e6:g} µm: {outcome.text}")
+        text = f"goal {handle.request.opening * 1e6:g} µm: {outcome.text}"
+        if outcome.success:
+            self.get_logger().info(text)
+        else:
+            self.get_logger().warning(text)
 
 
 def failure(text: str) -> Outcome:

@@ -1,0 +1,355 @@
+"""The gripper: its law, and the action in front of two simulated fingers, with real processes."""
+
+import math
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from action_msgs.msg import GoalStatus
+from ament_index_python.packages import get_package_prefix
+from hypothesis import given
+from hypothesis import strategies as st
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
+from rclpy.experimental.events_executor import EventsExecutor
+
+from piezo_control.gripper import (
+    Goal,
+    GripperParameters,
+    Motion,
+    check_goal,
+    force_of,
+    opening_of,
+)
+from piezo_control.parameters import ParameterError, build
+from piezo_control.qos import LATCHED
+from piezo_gripper_msgs.action import Grip
+from piezo_gripper_msgs.msg import FingerState
+from piezo_gripper_msgs.msg import Profile as ProfileMessage
+from piezo_sim.experiment.cases import params_folder
+
+EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
+TIMEOUT = 20.0  # s, generous: the tests wait on conditions
+SIDES = ("left", "right")
+DEFAULTS = GripperParameters()
+
+# --- the law ----------------------------------------------------------------------------------------
+
+
+@given(
+    opening=st.floats(0.0, 80e-6),
+    start=st.floats(-20e-6, 20e-6),
+    speed=st.floats(1e-6, 1e-3),
+    time=st.floats(0.0, 100.0),
+)
+def test_a_line_goes_from_the_reference_to_half_the_way_at_half_the_speed(
+    opening, start, speed, time
+):
+    motion = Motion(DEFAULTS, Goal(opening, 1e-3, speed), [start, start])
+    line = motion.depart(0, time, start)
+    assert opening_of(DEFAULTS, 2 * [line.at(math.inf)]) == pytest.approx(opening, abs=1e-15)
+    if line.time.size == 2:
+        assert (line.time[0], line.value[0]) == (time, start)
+        way, duration = abs(line.value[1] - start), line.time[1] - time
+        assert way == pytest.approx(duration * speed / 2, abs=speed * 1e-13)  # 100 s have 53 bits
+
+
+def test_force_is_the_larger_push_and_a_pull_is_none():
+    assert force_of([-2e-3, -1e-3]) == 2e-3
+    assert force_of([3e-3, -1e-3]) == 1e-3
+    assert force_of([3e-3, 0.0]) == 0.0
+
+
+def closing(opening=20e-6, max_force=1e-3):
+    """A motion from rest at 20 µm/s, departed at time 1 s: (40 - 20) µm last 1 s."""
+    motion = Motion(DEFAULTS, Goal(opening, max_force, 20e-6), [0.0, 0.0])
+    for finger in (0, 1):
+        motion.depart(finger, 1.0, 0.0)
+    return motion
+
+
+def test_opening_counts_as_reached_only_when_both_ramps_are_over():
+    there = [10e-6, 10e-6]
+    assert closing().decide([2.1, 1.9], there, [0.0, 0.0]) is None
+    outcome = closing().decide([2.1, 2.0], there, [0.0, 0.0])
+    assert (outcome.success, outcome.reached_goal, outcome.stalled) == (True, True, False)
+
+
+def test_motion_that_has_not_departed_is_not_over():
+    motion = Motion(DEFAULTS, Goal(20e-6, 1e-3, 20e-6), [10e-6, 10e-6])
+    motion.depart(0, 5.0, 10e-6)
+    assert motion.decide([9.0, 9.0], [10e-6, 10e-6], [0.0, 0.0]) is None
+
+
+def test_fingers_that_come_no_further_have_stalled_after_the_settling_time():
+    short = [8e-6, 8e-6]
+    assert closing().decide([2.5, 2.5], short, [-5e-4, -5e-4]) is None
+    outcome = closing().decide([2.51, 2.51], short, [-5e-4, -5e-4])
+    assert (outcome.success, outcome.reached_goal, outcome.stalled) == (False, False, True)
+    assert "+4.00 µm from the opening" in outcome.text
+
+
+def test_force_ends_closing_and_does_not_hinder_opening():
+    pushed = [0.0, -1e-3]
+    outcome = closing().decide([1.5, 1.5], [5e-6, 5e-6], pushed)
+    assert (outcome.success, outcome.reached_goal, outcome.stalled) == (True, False, True)
+    motion = Motion(DEFAULTS, Goal(40e-6, 1e-3, 20e-6), [5e-6, 5e-6])
+    assert motion.decide([1.5, 1.5], [5e-6, 5e-6], pushed) is None
+
+
+def test_goal_takes_defaults_for_zero():
+    assert check_goal(DEFAULTS, 0.0, 0.0, 0.0) == Goal(0.0, 5e-3, 20e-6)
+    assert check_goal(DEFAULTS, 8e-5, 1e-3, 1e-4) == Goal(8e-5, 1e-3, 1e-4)
+
+
+@pytest.mark.parametrize(
+    "goal, message",
+    [
+        ((81e-6, 0.0, 0.0), r"opening is 8.1e-05, must be in \[0, 8e-05\] m"),
+        ((-1e-6, 0.0, 0.0), "opening is -1e-06"),
+        ((math.nan, 0.0, 0.0), "opening is nan"),
+        ((20e-6, 6e-3, 0.0), r"max_force is 0.006, must be in \[0, 0.005\] N"),
+        ((20e-6, -1e-3, 0.0), "max_force is -0.001"),
+        ((20e-6, 0.0, -1e-9), r"speed is -1e-09, must be in \[0, 0.001\] m/s"),
+        ((20e-6, 0.0, math.inf), "speed is inf"),
+    ],
+)
+def test_goal_out_of_range_is_named(goal, message):
+    with pytest.raises(ValueError, match=message):
+        check_goal(DEFAULTS, *goal)
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"deflection_high": 21e-6}, r"'deflection_high' is 2.1e-05 m: .* \[0, 2e-05\] m"),
+        ({"speed": 2e-3}, "'speed' is 0.002 m/s, must be at most 'speed_limit' 0.001"),
+    ],
+)
+def test_parameters_that_contradict_each_other_are_refused(values, message):
+    with pytest.raises(ParameterError, match=message):
+        build(GripperParameters, values)
+
+
+# --- the node, in front of two fingers --------------------------------------------------------------
+
+STIFFNESS = 200.0  # N/m
+FREE_PLAY = 5e-6  # m, so tips touch the object at an opening of 30 µm
+
+
+class Bench:
+    """Two simulated fingers, the gripper, and a client; every wait is for a condition."""
+
+    def __init__(self, folder):
+        object_file = folder / "object.yaml"
+        contact = {"stiffness": STIFFNESS, "free_play": FREE_PLAY}
+        object_file.write_text(
+            yaml.safe_dump({"/**/cantilever": {"ros__parameters": {"contact": contact}}})
+        )
+        files = [params_folder() / f"{n}.yaml" for n in ("cantilever", "feedforward")]
+        files += [params_folder() / "feedback_paper.yaml", object_file]
+        self.log = folder / "gripper.log"
+        self.processes = {}
+        for side in SIDES:
+            self._start(side, "finger", folder, files, "-r", f"__ns:=/{side}")
+        self._start("gripper", "gripper", folder, [params_folder() / "gripper.yaml"])
+        self.node = rclpy.create_node("client")
+        self.executor = EventsExecutor()
+        self.executor.add_node(self.node)
+        self.states, self.references = {}, {side: [] for side in SIDES}
+        for side in SIDES:
+            self.node.create_subscription(
+                FingerState, f"{side}/state", lambda s, k=side: self.states.update({k: s}), LATCHED
+            )
+            self.node.create_subscription(
+                ProfileMessage, f"{side}/reference_profile", self.references[side].append, LATCHED
+            )
+        self.client = ActionClient(self.node, Grip, "grip")
+
+    def _start(self, name, executable, folder, files, *arguments):
+        command = [EXECUTABLES / executable, "--ros-args", *arguments]
+        for file in files:
+            command += ["--params-file", file]
+        with (folder / f"{name}.log").open("wb") as log:
+            self.processes[name] = subprocess.Popen(
+                command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    def close(self):
+        for process in self.processes.values():
+            process.terminate()
+        codes = [process.wait(TIMEOUT) for process in self.processes.values()]
+        self.executor.shutdown()
+        self.client.destroy()
+        self.node.destroy_node()
+        return codes
+
+    def wait(self, done):
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            assert time.monotonic() < end, self.log.read_text()
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def result_of(self, future):
+        self.wait(future.done)
+        return future.result()
+
+    def send(self, opening, max_force=0.0, speed=200e-6, feedback=None):
+        goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
+        return self.result_of(self.client.send_goal_async(goal, feedback_callback=feedback))
+
+    def grip(self, *goal, **more):
+        handle = self.send(*goal, **more)
+        assert handle.accepted, self.log.read_text()
+        return self.result_of(handle.get_result_async())
+
+    def moving(self, handle):
+        """Wait until a goal is on its way to an opening of 10 µm, 60 s away."""
+        assert handle.accepted, self.log.read_text()
+        self.wait(lambda: all(r and len(r[-1].time) == 2 for r in self.references.values()))
+
+    def held(self):
+        """Return the references as they stay, once they do."""
+        self.wait(lambda: all(len(r[-1].time) == 1 for r in self.references.values()))
+        return [r[-1].value[0] for r in self.references.values()]
+
+
+@pytest.fixture
+def bench(tmp_path):
+    rclpy.init()
+    bench = Bench(tmp_path)
+    try:
+        bench.wait(lambda: len(bench.states) == 2 and bench.client.server_is_ready())
+        bench.wait(lambda: all(s.phase == FingerState.RUNNING for s in bench.states.values()))
+        # The gripper has to have met the fingers too; until then it refuses.
+        bench.wait(lambda: bench.send(40e-6).accepted)
+        yield bench
+    finally:
+        codes = bench.close()
+        rclpy.shutdown()
+    assert all(code in (0, -signal.SIGKILL) for code in codes)
+
+
+SLOW = 0.5e-6  # m/s: any way lasts for the whole test
+
+
+def test_grip_and_release_an_object(bench):
+    speed, limit = 20e-6, 0.2e-3  # N: 1 µm into the object
+    felt = []
+    answer = bench.grip(20e-6, limit, speed, feedback=lambda m: felt.append(m.feedback))
+    result = answer.result
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED
+    assert (result.reached_goal, result.stalled) == (False, True)
+    # Each tip is `force / stiffness` in the object. The larger force is told, the sensor has a delay, a
+    # quantum of 10 nm and 5 nm of noise, and two fingers each in its own time may be 0.2 s apart.
+    touching = 40e-6 - 2 * FREE_PLAY
+    assert limit <= result.force
+    assert touching - 2 * result.force / STIFFNESS - 0.1e-6 < result.opening < touching
+    assert felt[0].force == 0.0 and felt[0].opening == pytest.approx(40e-6, abs=0.3e-6)
+    held = bench.held()
+    answer = bench.grip(36e-6)  # away from the object, although the force is at its limit
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED
+    assert (answer.result.reached_goal, answer.result.stalled) == (True, False)
+    assert answer.result.force == 0.0
+    assert answer.result.opening == pytest.approx(36e-6, abs=DEFAULTS.tolerance)
+    # Without a bump: the line to 36 µm begins where the references were held.
+    for side, reference in zip(SIDES, held):
+        line = next(r for r in reversed(bench.references[side]) if len(r.time) == 2)
+        assert line.value[0] == reference
+        assert line.value[1] == pytest.approx(2e-6, abs=1e-15)
+
+
+def test_ramp_passes_in_the_fingers_own_time(bench):
+    heard = []
+    bench.node.create_subscription(FingerState, "left/state", heard.append, LATCHED)
+    answer = bench.grip(32e-6, 0.0, 10e-6)  # 8 µm at 10 µm/s: 0.8 s
+    assert answer.result.reached_goal
+    line = next(r for r in reversed(bench.references["left"]) if len(r.time) == 2)
+    assert line.interpolation == ProfileMessage.LINEAR
+    slope = (line.value[1] - line.value[0]) / (line.time[1] - line.time[0])
+    assert slope == pytest.approx(5e-6, rel=1e-9)
+    # The loop answers a step within 50 ms, so on a ramp of 5 µm/s it is 0.25 µm late at most.
+    points = [(s.samples * 1e-4, s.deflection) for s in heard]
+    points = [(t, d) for t, d in points if line.time[0] + 0.05 < t < line.time[1]]
+    assert len(points) >= 2
+    for instant, deflection in points:
+        reference = line.value[0] + slope * (instant - line.time[0])
+        assert reference - 0.25e-6 < deflection < reference + 0.05e-6
+
+    assert not bench.send(0.2e-3).accepted
+    bench.wait(lambda: "opening is 0.0002, must be in [0, 8e-05] m" in bench.log.read_text())
+
+
+def test_canceled_goal_holds_on_the_way(bench):
+    handle = bench.send(10e-6, 0.0, SLOW)
+    bench.moving(handle)
+    assert bench.result_of(handle.cancel_goal_async()).goals_canceling
+    answer = bench.result_of(handle.get_result_async())
+    assert answer.status == GoalStatus.STATUS_CANCELED
+    assert not answer.result.reached_goal
+    assert all(-1e-6 < reference < 14e-6 for reference in bench.held())
+
+
+def test_new_goal_takes_over_and_the_old_one_is_aborted(bench):
+    old = bench.send(10e-6, 0.0, SLOW)
+    bench.moving(old)
+    assert old.status == GoalStatus.STATUS_EXECUTING
+    new = bench.send(38e-6)
+    assert bench.result_of(old.get_result_async()).status == GoalStatus.STATUS_ABORTED
+    answer = bench.result_of(new.get_result_async())
+    assert answer.status == GoalStatus.STATUS_SUCCEEDED
+    assert "a new goal takes over" in bench.log.read_text()
+
+
+def test_finger_that_stops_aborts_the_goal_and_stays_at_rest(bench):
+    handle = bench.send(10e-6, 0.0, SLOW)
+    bench.moving(handle)
+    change = bench.node.create_client(ChangeState, "right/feedforward/change_state")
+    bench.wait(change.service_is_ready)
+    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    bench.result_of(change.call_async(request))
+    answer = bench.result_of(handle.get_result_async())
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert bench.states["right"].phase == FingerState.FAULT
+    assert "finger 'right' is FAULT (no answer to sample" in bench.log.read_text()
+    left, right = bench.held()
+    assert right == 0.0
+    assert -1e-6 < left < 14e-6
+    assert not bench.send(30e-6).accepted
+
+
+def test_silent_finger_aborts_the_goal(bench):
+    handle = bench.send(10e-6, 0.0, SLOW)
+    bench.moving(handle)
+    os.killpg(bench.processes["left"].pid, signal.SIGKILL)
+    answer = bench.result_of(handle.get_result_async())
+    assert answer.status == GoalStatus.STATUS_ABORTED
+    assert "finger 'left' is silent: nothing on '/left/state'" in bench.log.read_text()
+
+
+@pytest.mark.parametrize("end", ["deactivation", "SIGINT"])
+def test_stopped_gripper_holds_and_lets_the_client_know(bench, end):
+    felt = []
+    handle = bench.send(10e-6, 0.0, SLOW, feedback=felt.append)
+    bench.moving(handle)
+    result = handle.get_result_async()
+    felt.clear()
+    bench.wait(lambda: len(felt) > 2)  # by then the gripper knows that somebody wants the result
+    if end == "deactivation":
+        change = bench.node.create_client(ChangeState, "gripper/change_state")
+        bench.wait(change.service_is_ready)
+        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+        assert bench.result_of(change.call_async(request)).success
+    else:
+        bench.processes["gripper"].send_signal(signal.SIGINT)
+    assert bench.result_of(result).status == GoalStatus.STATUS_ABORTED
+    assert all(-1e-6 < reference < 14e-6 for reference in bench.held())
+    if end == "deactivation":
+        assert not bench.send(30e-6).accepted
+        bench.wait(lambda: "the gripper is not active" in bench.log.read_text())
