@@ -30,6 +30,7 @@ UM, MS, MN = 1e6, 1e3, 1e3
 COOL, WARM = "tab:blue", "tab:red"
 OTHERS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:pink")
 WARM_FROM = 27.0  # °C
+HELD = 0.02  # s before a disturbance over which the held deflection is averaged
 DOTS_PER_INCH = 110
 
 
@@ -127,9 +128,9 @@ def _disturbance(panels: Panels, path: Path, signal: str, label: str, scale: flo
         for _, line, recording in _lines([upper], {title: lines}):
             values = getattr(recording, signal)
             begin = int(np.argmax(values != values[0]))
-            shown = recording.time >= recording.time[begin] - 0.25 * np.ptp(recording.time[begin:])
-            before = recording.time < recording.time[begin]
-            held = np.mean(recording.deflection[shown & before])
+            time = recording.time - recording.time[begin]
+            held = np.mean(recording.deflection[(time >= -HELD) & (time < 0.0)])
+            shown = time >= -max(HELD, 0.04 * time[-1])
             time = recording.time[shown]
             upper.plot(time, values[shown] * scale, lw=1, **line)
             middle.plot(time, (recording.deflection[shown] - held) * UM, lw=0.6, **line)

@@ -11,6 +11,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 
@@ -48,12 +49,15 @@ def write_html(path: Path, title: str, sections: Iterable[Section], footer: str 
 
 def print_table(console: Console, section: Section) -> None:
     """Print the section's table on the terminal."""
-    table = Table(title=section.title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(
+        title=escape(section.title), title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False
+    )
     for column in section.columns:
         is_first = column == section.columns[0]
-        table.add_column(column, justify="left" if is_first else "right", overflow="fold")
+        justify = "left" if is_first else "right"
+        table.add_column(escape(column), justify=justify, overflow="fold", no_wrap=is_first)
     for row in section.rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     console.print(table)
 
 

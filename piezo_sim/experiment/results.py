@@ -40,6 +40,7 @@ CAPTIONS = {
     "thermal": "Temperature, deflection from the value held before, and voltage.",
     "force": "Tip force, deflection from the value held before, and voltage.",
 }
+DRIVEN_BY_VOLTAGE = ("transient", "creep", "hysteresis")
 CLOSED_LOOP_AXIS = 0.045  # s: time axis of Fig. 13
 
 
@@ -57,6 +58,8 @@ class Result:
         case = self.run.case
         if case.mode == "feedback":
             return f"feedforward and feedback: {case.controller}"
+        if case.analysis in DRIVEN_BY_VOLTAGE:
+            return "voltage applied as it is"
         return MODE_TITLES[case.mode]
 
     @property
