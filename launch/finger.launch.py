@@ -4,6 +4,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterFile
 from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS = {
@@ -16,14 +17,13 @@ ARGUMENTS = {
 
 def generate_launch_description() -> LaunchDescription:
     params = PathJoinSubstitution([FindPackageShare("piezo_gripper"), "params"])
-    controller = ["feedback_", LaunchConfiguration("controller"), ".yaml"]
     common = {"mode": LaunchConfiguration("mode")}
     sampled = {**common, "sample_time": LaunchConfiguration("sample_time")}
     nodes = {
-        "temperature": ("temperature.yaml", common),
-        "feedforward": ("feedforward.yaml", sampled),
-        "feedback": (controller, common),
-        "cantilever": ("cantilever.yaml", {**sampled, "temperature_lockstep": True}),
+        "temperature": (["temperature.yaml"], common),
+        "feedforward": (["feedforward.yaml"], sampled),
+        "feedback": (["feedback_", LaunchConfiguration("controller"), ".yaml"], common),
+        "cantilever": (["cantilever.yaml"], {**sampled, "temperature_lockstep": True}),
     }
     return LaunchDescription(
         [
@@ -36,7 +36,7 @@ def generate_launch_description() -> LaunchDescription:
                     package="piezo_gripper",
                     executable=name,
                     namespace=LaunchConfiguration("namespace"),
-                    parameters=[PathJoinSubstitution([params, file]), changes],
+                    parameters=[ParameterFile([params, "/", *file]), changes],
                     output="screen",
                 )
                 for name, (file, changes) in nodes.items()
