@@ -2,12 +2,13 @@
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
 
-.PHONY: help env demo paper bench test lint clean distclean
+.PHONY: help env demo paper figures bench test lint clean distclean
 
 help:
 	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
 	@echo "make test       lint and all tests"
 	@echo "make paper      every experiment of the paper; results in out/paper"
+	@echo "make figures    the same, and the pictures of the README in docs/"
 	@echo "make bench      speed of the loop; results in out/bench.json"
 	@echo "make lint       ruff only"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
@@ -20,7 +21,10 @@ demo: env
 	$(RUN) experiment step --out out/demo --overwrite
 
 paper: env
-	$(RUN) experiment all --out out/paper
+	$(RUN) experiment all --out out/paper --overwrite
+
+figures: paper
+	$(RUN) python docs/figures.py out/paper
 
 bench: env
 	$(RUN) python bench/run.py --out out/bench.json
