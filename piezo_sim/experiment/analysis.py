@@ -90,6 +90,11 @@ def hysteresis(recording: Recording) -> Figures:
     }
 
 
+def excite(recording: Recording) -> Figures:
+    """Return the deflection's range under an excitation for identification."""
+    return {"peak_to_peak_um": float(np.ptp(recording.deflection)) * 1e6}
+
+
 def feedforward(recording: Recording) -> Figures:
     """Return the figures of the last cycle of deflection over reference (Fig. 9)."""
     loop = _loop(recording, "reference")
@@ -174,7 +179,17 @@ def force(recording: Recording) -> Figures:
 
 ANALYSES: dict[str, Callable[[Recording], Figures]] = {
     a.__name__: a
-    for a in (transient, creep, hysteresis, feedforward, step, frequency, thermal, force)
+    for a in (
+        transient,
+        creep,
+        hysteresis,
+        excite,
+        feedforward,
+        step,
+        frequency,
+        thermal,
+        force,
+    )  # fmt: skip
 }
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from ament_index_python.packages import get_package_share_directory
 
+from piezo_control.excitation import decaying_sine
 from piezo_control.feedback_node import FeedbackNodeParameters
 from piezo_control.feedforward_node import FeedforwardNodeParameters
 from piezo_control.parameters import ParameterError, build, load
@@ -36,7 +37,7 @@ EXPERIMENT_KEYS = {
 }  # fmt: skip
 RUN_KEYS = (EXPERIMENT_KEYS - {"title", "runs"}) | {
     "name", "analysis", "duration", "every", "reference", "voltage", "tip_force", "mode",
-    "temperature",
+    "temperature", "params",
 }  # fmt: skip
 NEEDED_KEYS = ("name", "duration", "sample_time", "mode")
 UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
@@ -46,7 +47,7 @@ UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
 class Case:
     """One run of one finger. Times in s; reference in m, tip force in N.
 
-    `analysis` names the analysis of its recording; on the `engine`, every `every`-th sample is recorded.
+    Parameter files in the folder `params` take the place of the shipped ones of the same name. `analysis` names the analysis of its recording; on the `engine`, every `every`-th sample is recorded.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Case:
     analysis: str = ""
     engine: bool = False
     every: int = 1
+    params: Path | None = None
 
     @property
     def samples(self) -> int:
@@ -70,7 +72,6 @@ class Case:
 
     def parameters(self, bag: Path | None = None) -> dict[str, Any]:
         """Return the parameter dataclass of every node for this run."""
-        share = params_folder()
         grid = max(1e-3, self.sample_time)
         changes: dict[str, dict[str, Any]] = {
             "feedforward": {
@@ -96,13 +97,9 @@ class Case:
                 "clock_period": 10 * grid,
             },
         }
-        files = {
-            "feedforward": share / "feedforward.yaml",
-            "temperature": share / "temperature.yaml",
-            "cantilever": share / "cantilever.yaml",
-        }
+        files = {n: self._file(n) for n in ("feedforward", "temperature", "cantilever")}
         if self.mode == "feedback":
-            files["feedback"] = share / f"feedback_{self.controller}.yaml"
+            files["feedback"] = self._file(f"feedback_{self.controller}")
         else:
             changes["feedback"]["sample_time"] = self.sample_time
         parameters = {}
@@ -117,6 +114,10 @@ class Case:
                 f"'{self.controller}': {parameters['feedback'].sample_time:g} s"
             )
         return parameters
+
+    def _file(self, name: str) -> Path:
+        own = self.params / f"{name}.yaml" if self.params else None
+        return own if own and own.exists() else params_folder() / f"{name}.yaml"
 
 
 def params_folder() -> Path:
@@ -215,6 +216,7 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
                 temperature=run.get("temperature") or {"profile": "constant", "base_degc": degc},
                 engine=run.get("engine", False),
                 every=run.get("every", 1),
+                params=run.get("params"),
             )
         )
     return cases
@@ -244,6 +246,7 @@ def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
 
     * `step`: to `amplitude_<unit>` at `start` (default 0);
     * `sine`: `amplitude_<unit>`, `frequency_hz`, `periods`;
+    * `decaying_sine`: `amplitude_<unit>`, `frequency_hz`, `cycles` (piezo_control.excitation);
     * `points`: `time` and `value_<unit>`, joined by straight lines;
     * `multisine`: two periods of `period`, of about `lines` cosines with frequencies from 1 / `period` to
       `highest_rad_s`, evenly spaced on a logarithmic axis and multiples of the lowest one; equally
@@ -264,6 +267,9 @@ def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
             height, frequency = values.pop(f"amplitude_{unit}") * scale, values.pop("frequency_hz")
             time = np.linspace(0.0, values.pop("periods") / frequency, 2000)
             made = Profile(time, height * np.sin(2 * np.pi * frequency * time), True)
+        elif kind == "decaying_sine":
+            height = values.pop(f"amplitude_{unit}") * scale
+            made = decaying_sine(height, values.pop("cycles"), values.pop("frequency_hz"))
         elif kind == "multisine":
             height = values.pop(f"amplitude_{unit}") * scale
             time, wave = multisine(
@@ -272,7 +278,8 @@ def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
             made = Profile(time, height * wave, True)
         else:
             raise ParameterError(
-                f"{where}: shape is {kind!r}, must be 'step', 'sine', 'points' or 'multisine'"
+                f"{where}: shape is {kind!r}, must be 'step', 'sine', 'decaying_sine', 'points' or "
+                "'multisine'"
             )
     except KeyError as error:
         raise ParameterError(f"{where}: shape '{kind}' needs {error}") from None

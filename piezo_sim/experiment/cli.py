@@ -36,10 +36,11 @@ EXPERIMENTS = {
     "frequency": "closed-loop magnitude, 0.1 to 1e4 rad/s (Fig. 14)",
     "thermal": "a spotlight warms the finger while it holds",
     "force": "a force on the tip while the finger holds",
-    "all": "all of these with two controllers, against the paper: `make paper`",
+    "excite": "decaying sine of the voltage, made for `identify hysteresis`",
+    "all": "all of those of the paper with two controllers, against the paper: `make paper`",
 }
 DONE, FAILED, UNUSABLE = 0, 1, 2
-WIDTH_OF_LOGS = 120
+WIDTH_OF_LOGS = 160
 
 
 def main() -> int:
@@ -155,6 +156,10 @@ def _add_experiment_options(command: argparse.ArgumentParser, name: str) -> None
     )  # fmt: skip
     command.add_argument("--amplitude-um", type=float, help="height of the reference in µm")
     command.add_argument("--amplitude-v", type=float, help="height of the voltage in V")
+    command.add_argument(
+        "--params", type=Path, metavar="DIR",
+        help="folder whose parameter files replace the shipped ones of the same name, as of `identify`",
+    )  # fmt: skip
     command.add_argument("--sample-time", type=float, help="sample time in s")
     command.add_argument("--duration", type=float, help="length of every run in s")
     command.add_argument(
@@ -184,7 +189,7 @@ def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) ->
 
 OVERRIDES = (
     "controller", "plant", "temperature_degc", "amplitude_um", "amplitude_v", "sample_time",
-    "duration", "engine",
+    "duration", "engine", "params",
 )  # fmt: skip
 
 

@@ -63,6 +63,15 @@ def hysteresis(panels: Panels, path: Path) -> Path:
     return _save(figure, path)
 
 
+def excite(panels: Panels, path: Path) -> Path:
+    """Draw every cycle of deflection over voltage."""
+    figure, axes = _panels(panels)
+    for axis, line, recording in _lines(axes, panels):
+        axis.plot(recording.voltage, recording.deflection * UM, lw=0.7, **line)
+    _finish(axes, "U [V]", "deflection [µm]", "upper left")
+    return _save(figure, path)
+
+
 def feedforward(panels: Panels, path: Path) -> Path:
     """Draw the last cycle of deflection over reference, as Fig. 9."""
     figure, axes = _panels(panels)
@@ -114,7 +123,7 @@ def force(panels: Panels, path: Path) -> Path:
 
 PLOTS: dict[str, Callable[[Panels, Path], Path]] = {
     plot.__name__: plot
-    for plot in (transient, creep, hysteresis, feedforward, step, frequency, thermal, force)
+    for plot in (transient, creep, hysteresis, excite, feedforward, step, frequency, thermal, force)
 }
 
 

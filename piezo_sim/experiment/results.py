@@ -24,6 +24,7 @@ HEADINGS = {
     "transient": "Step of the voltage (Fig. 3)",
     "creep": "Creep (Fig. 4)",
     "hysteresis": "Hysteresis (Fig. 5)",
+    "excite": "Excitation for identification",
     "feedforward": "Feedforward alone (Fig. 9)",
     "step": "Step of the reference (Fig. 13)",
     "frequency": "Frequency response (Fig. 14)",
@@ -34,13 +35,14 @@ CAPTIONS = {
     "transient": "Deflection after a step of the voltage from rest.",
     "creep": "Deflection after a step of the voltage, over minutes.",
     "hysteresis": "Last cycle of deflection over voltage.",
+    "excite": "Deflection over voltage, every cycle.",
     "feedforward": "Last cycle of deflection over reference, through the inverse hysteresis.",
     "step": "Response to a step of the reference.",
     "frequency": "Magnitude from the reference to the deflection.",
     "thermal": "Temperature, deflection from the value held before, and voltage.",
     "force": "Tip force, deflection from the value held before, and voltage.",
 }
-DRIVEN_BY_VOLTAGE = ("transient", "creep", "hysteresis")
+DRIVEN_BY_VOLTAGE = ("transient", "creep", "hysteresis", "excite")
 CLOSED_LOOP_AXIS = 0.045  # s: time axis of Fig. 13
 
 
