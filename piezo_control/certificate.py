@@ -232,7 +232,11 @@ def weighted_norms(problem: DesignProblem, controller: FeedbackParameters) -> di
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table; `required`, `nominal` and `worst` in `unit`, `at` says which finger."""
+    """One line of the table.
+
+    `required` (a largest value, except for the gamma to be confirmed), `nominal` and `worst` are in
+    `unit`; `at` says which finger is the worst.
+    """
 
     specification: str
     unit: str
