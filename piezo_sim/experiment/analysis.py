@@ -33,6 +33,7 @@ QUANTITIES = {
     "loop_width_um": ("loop width [µm]", 2),
     "loop_width_percent": ("loop width [%]", 2),
     "slope": ("slope", 4),
+    "peak_error_percent": ("peak error [% of stroke]", 2),
     "slope_um_per_v": ("slope [µm/V]", 4),
     "bandwidth_rad_s": ("−3 dB [rad/s]", 0),
     "lowest_rad_s": ("from [rad/s]", 2),
@@ -96,10 +97,17 @@ def excite(recording: Recording) -> Figures:
 
 
 def feedforward(recording: Recording) -> Figures:
-    """Return the figures of the last cycle of deflection over reference (Fig. 9)."""
+    """Return the figures of the last cycle of deflection over reference (Fig. 9).
+
+    The peak error is the largest distance from the reference, in % of the reference's stroke.
+    """
     loop = _loop(recording, "reference")
+    cycle = metrics.last_cycle(recording.reference)
+    reference = recording.reference[cycle]
+    error = np.max(np.abs(recording.deflection[cycle] - reference)) / np.ptp(reference)
     return {
         "slope": loop.slope,
+        "peak_error_percent": float(error) * 100,
         "peak_to_peak_um": loop.peak_to_peak * 1e6,
         "loop_width_um": loop.width * 1e6,
         "loop_width_percent": loop.relative_width * 100,
