@@ -96,16 +96,18 @@ def write_recording(
         topic = bag.add(f"/{finger}/{name}_profile", PROFILE_TYPE, LATCHED)
         bag.write(topic, 0, _profile(bag, profile))
     stamps = np.rint(recording.time * 1e9).astype(int).tolist()
-    for name in ("deflection", "command", "voltage"):
-        topic = bag.add(f"/{finger}/{name}", SAMPLE_TYPE, SAMPLE)
-        for number, stamp, value in zip(
-            recording.number.tolist(), stamps, getattr(recording, name).tolist()
-        ):
-            data = SAMPLE_CDR.pack(LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, value)
+    signals = [
+        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE, SAMPLE), getattr(recording, name).tolist())
+        for name in ("deflection", "command", "voltage")
+    ]
+    warmth = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE, SAMPLE)
+    changes = set(np.flatnonzero(np.diff(recording.temperature, prepend=np.nan)).tolist())
+    for k, (number, stamp) in enumerate(zip(recording.number.tolist(), stamps)):
+        if k in changes:
+            bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
+        for topic, values in signals:
+            data = SAMPLE_CDR.pack(LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, values[k])
             bag.write(topic, stamp, data)
-    topic = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE, SAMPLE)
-    for k in np.flatnonzero(np.diff(recording.temperature, prepend=np.nan)):
-        bag.write(topic, stamps[k], _temperature(bag, stamps[k], recording.temperature[k]))
     bag.close()
 
 
