@@ -1,0 +1,341 @@
+"""The paper's table: every number again, by formulas of this file's own, from the bags of shorter runs."""
+
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+from rich.progress import Progress
+from rosbags.highlevel import AnyReader
+
+from piezo_control.parameters import ParameterError
+from piezo_control.recording import BagError, read
+from piezo_sim.experiment import cli, paper, results
+from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
+from piezo_sim.experiment.cases import multisine, profile, read_experiment
+from piezo_sim.experiment.engine_runner import run_on_engine
+
+LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
+H = 1e-4
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """All cases of `experiment all`, shorter and on the engine, but for the low band of Fig. 14."""
+    out = tmp_path_factory.mktemp("paper")
+    _, cases = read_experiment("all", {})
+    found = []
+    with Progress(disable=True) as progress:
+        for case in cases:
+            if case.name.startswith("frequency_low"):
+                continue
+            duration = min(case.duration, LONGEST.get(case.analysis, case.duration))
+            shorter = dataclasses.replace(case, duration=duration, engine=True)
+            found.append(results.result(run_on_engine(shorter, out, "finger", progress)))
+    return out, found
+
+
+@pytest.fixture(scope="module")
+def lines(short):
+    return {line["quantity"].split(" [")[0]: line for line in paper.compare(short[1])}
+
+
+def raw(bag, name):
+    """Stamps (s) and values of one topic, straight from the messages."""
+    with AnyReader([bag]) as reader:
+        chosen = [c for c in reader.connections if c.topic == f"/finger/{name}"]
+        messages = [reader.deserialize(d, c.msgtype) for c, _, d in reader.messages(chosen)]
+    time = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages])
+    key = "temperature" if name == "temperature" else "value"
+    return time, np.array([getattr(m, key) for m in messages])
+
+
+def bags(short, prefix):
+    out, found = short
+    return [r.run.bag for r in found if r.run.case.name.startswith(prefix)]
+
+
+def test_all_experiments_have_both_controllers_and_temperatures(short):
+    names = [r.run.case.name for r in short[1]]
+    for kind in ("step_feedback", "frequency_high"):
+        for controller in ("paper", "robust"):
+            assert {f"{kind}_{controller}_{t}degc" for t in (22, 32)} <= set(names)
+    assert sum(name.startswith(("transient", "creep", "hysteresis")) for name in names) == 6
+
+
+def test_fig_3(short, lines):
+    tails = []
+    for column, bag in enumerate(bags(short, "transient")):
+        time, value = raw(bag, "deflection")
+        tails.append(np.mean(value[-80:]))
+        swing = value - tails[-1]
+        # frequency: maximum of a zero-padded spectrum; damping: rms of two windows of 15 periods apart
+        spectrum = np.abs(np.fft.rfft(swing * np.hanning(swing.size), 2**18))
+        frequency = np.argmax(spectrum) / (2**18 * H)
+        window = round(15 / frequency / H)
+        first, second = (
+            np.sqrt(np.mean(swing[n * window : (n + 1) * window] ** 2)) for n in (0, 1)
+        )
+        ratio = np.log(first / second) / (2 * np.pi * 15)
+        values = {k: line["values"]["none"] for k, line in lines.items() if k.startswith("Fig. 3")}
+        assert values["Fig. 3: vibration after a 40 V step"][column] == pytest.approx(
+            frequency, rel=2e-3
+        )
+        assert values["Fig. 3: damping ratio"][column] == pytest.approx(ratio, rel=0.02)
+        assert values["Fig. 3: final deflection"][column] == pytest.approx(tails[-1] * 1e6)
+    cool, warm = (raw(b, "deflection")[1] / t for b, t in zip(bags(short, "transient"), tails))
+    (change,) = lines["Fig. 3: transient at 32 against 22 °C, final values made equal"]["values"][
+        "none"
+    ]
+    assert change == pytest.approx(100 * max(abs(w - c) for w, c in zip(warm, cool)))
+
+
+def test_fig_4(short, lines):
+    crept = []
+    for bag in bags(short, "creep"):
+        time, value = raw(bag, "deflection")
+        late = value[time > time[-1] - 0.5]
+        early = [v for t, v in zip(time, value) if 1.0 - 1e-9 <= t < 1.5 - 1e-9]
+        crept.append((sum(late) / len(late) - sum(early) / len(early)) * 1e6)
+    assert lines["Fig. 4: creep at 22 / 32 °C"]["values"]["none"] == pytest.approx(crept, abs=2e-4)
+    key = "Fig. 4: creep from 1 s to 300 s, at 32 against 22 °C"
+    assert lines[key]["values"]["none"] == pytest.approx([crept[1] / crept[0]], rel=0.02)
+
+
+def cycle(bag, drive):
+    """Time, drive and deflection from the maximum at 0.25 s to that at 1.25 s of a 1 Hz sine."""
+    recording = read(bag)
+    inside = (recording.time > 0.25 - 1e-6) & (recording.time < 1.25 + 1e-6)
+    return getattr(recording, drive)[inside], raw(bag, "deflection")[1][inside]
+
+
+def width(drive, value):
+    """Largest height of the loop, from each sample of the falling branch to the rising one."""
+    turn = np.argmin(drive)
+    rising = sorted(zip(drive[turn:], value[turn:]))
+    x, y = np.transpose(rising)
+    inside = drive[:turn] < min(drive[0], drive[-1])
+    return max(
+        abs(v - np.interp(d, x, y)) for d, v in zip(drive[:turn][inside], value[:turn][inside])
+    )
+
+
+def test_fig_5(short, lines):
+    loops = [cycle(bag, "voltage") for bag in bags(short, "hysteresis")]
+    spread = [(max(y) - min(y)) * 1e6 for _, y in loops]
+    percent = [100 * width(x, y) / np.ptp(y) for x, y in loops]
+    values = {k: line["values"].get("none") for k, line in lines.items()}
+    assert values["Fig. 5: peak to peak at ±40 V, 1 Hz"] == pytest.approx(spread, rel=1e-6)
+    assert values["Fig. 5: width of the loop"] == pytest.approx(percent, rel=5e-3)
+    change = values["Fig. 5: width at 32 less that at 22 °C"]
+    assert change == pytest.approx([percent[1] - percent[0]], abs=0.1)
+
+
+def test_fig_9(short, lines):
+    loops = [cycle(bag, "reference") for bag in bags(short, "feedforward")]
+    slopes = [
+        np.sum((x - x.mean()) * (y - y.mean())) / np.sum((x - x.mean()) ** 2) for x, y in loops
+    ]
+    left = [100 * width(x, y) / np.ptp(y) for x, y in loops]
+    values = {k: line["values"].get("none") for k, line in lines.items()}
+    assert values["Fig. 9: slope at 22 / 32 °C"] == pytest.approx(slopes, rel=1e-4)
+    assert values["Fig. 9: slope at 22 °C"] == pytest.approx(slopes[:1], rel=1e-4)
+    assert values["Fig. 9: change of the slope at 32 °C"] == pytest.approx(
+        [slopes[1] - slopes[0]], abs=2e-4
+    )
+    assert values["Fig. 9: loop left over"] == pytest.approx(left, abs=0.05)
+
+
+@pytest.mark.parametrize("controller", ["paper", "robust"])
+def test_fig_13_and_specification(short, lines, controller):
+    settling, overshoot, error = [], [], []
+    for bag in bags(short, f"step_feedback_{controller}"):
+        time, value = raw(bag, "deflection")
+        final = np.mean(value[-60:])  # the last tenth
+        k = value.size
+        while k and abs(value[k - 1] - final) <= 0.05 * final:
+            k -= 1
+        settling.append(time[k] * 1e3)
+        overshoot.append(100 * max(0.0, max(value) / 20e-6 - 1))
+        error.append(100 * abs(1 - final / 20e-6))
+    values = {k: line["values"].get(controller) for k, line in lines.items()}
+    assert values["Fig. 13: settling to 5 %"] == pytest.approx(settling)
+    assert values["Specification: response time, to 5 %"] == pytest.approx(settling)
+    assert values["Specification: overshoot"] == pytest.approx(overshoot)
+    assert values["Specification: static error"] == pytest.approx(error)
+
+
+@pytest.mark.parametrize("controller", ["paper", "robust"])
+def test_disturbances(short, lines, controller):
+    (bag,) = bags(short, f"thermal_feedback_{controller}")
+    time, value = raw(bag, "deflection")
+    warmth = raw(bag, "temperature")
+    start = warmth[0][warmth[1] != 22.0][0]
+    held = np.mean(value[(time > start - 0.02 - H / 2) & (time < start - H / 2)])
+    total = np.cumsum(np.append(0.0, value[time > start - H / 2]))
+    mean = (total[100:] - total[:-100]) / 100  # over 10 ms
+    key = "Specification: thermal disturbance, spotlight"
+    expected = 10 * np.max(np.abs(mean - held)) * 1e6 / (np.max(warmth[1]) - 22.0)
+    assert lines[key]["values"][controller] == pytest.approx([expected], rel=0.02)
+
+    (bag,) = bags(short, f"force_feedback_{controller}")
+    time, value = raw(bag, "deflection")
+    held = np.mean(value[(time > 0.13 - H / 2) & (time < 0.15 - H / 2)])
+    after, since = value[time > 0.15 - H / 2], time[time > 0.15 - H / 2] - 0.15
+    largest, last = np.max(np.abs(after - held)), np.mean(value[-200:])
+    outside = np.abs(after - last) > 0.05 * largest
+    deviation = lines["1 mN on the tip: largest deviation"]["values"][controller]
+    assert deviation == pytest.approx([largest * 1e6])
+    recovery = lines["1 mN on the tip: recovery to 5 %"]["values"][controller]
+    assert recovery == pytest.approx([(since[outside][-1] + H) * 1e3], abs=1e-6)
+
+
+@pytest.mark.parametrize("controller", ["paper", "robust"])
+def test_fig_14(short, lines, controller):
+    bands, curves = [], []
+    for bag in bags(short, f"frequency_high_{controller}"):
+        reference, value = read(bag).reference[6300:], raw(bag, "deflection")[1][6300:]
+        n = np.unique(np.rint(np.geomspace(1, int(1e4 * 0.63 / (2 * np.pi)), 40)))
+        kernel = np.exp(-2j * np.pi * np.outer(n, np.arange(6300)) / 6300)
+        level = 20 * np.log10(np.abs((kernel @ value) / (kernel @ reference)))
+        omega = 2 * np.pi * n / 0.63
+        i = next(i for i, loss in enumerate(level[0] - level) if loss > 3.0)
+        pair = slice(i - 1, i + 1)  # a straight line in dB over the logarithm of the frequency
+        bands.append(np.exp(np.interp(3.0, level[0] - level[pair], np.log(omega[pair]))))
+        curves.append(level[omega <= bands[0]])
+    values = {k: line["values"].get(controller) for k, line in lines.items()}
+    assert values["Fig. 14: cut-off, −3 dB"] == pytest.approx(bands, rel=1e-3)
+    key = "Fig. 14: magnitude at 32 against 22 °C, up to the cut-off"
+    assert values[key] == pytest.approx([np.max(np.abs(curves[1] - curves[0]))], abs=1e-3)
+
+
+def test_verdicts_follow_from_values_and_limits(short, lines):
+    assert (
+        lines["Specification: response time, to 5 %"]["met"]["paper"] is False
+    )  # 13.3 ms in theory
+    assert lines["Specification: static error"]["met"]["paper"] is False  # 0.68 % in theory
+    assert lines["Fig. 13: settling to 5 %"]["met"]["paper"] is True
+    assert lines["Fig. 3: final deflection"]["met"]["none"] is False  # 22 µm; the paper shows 30 µm
+    assert lines["Fig. 5: width of the loop"]["met"]["none"] is None
+    section = paper.section(short[1])
+    assert all(len(row) == len(section.columns) for row in section.rows)
+    assert "paper's K missed" in section.rows[list(lines).index("Specification: static error")][-1]
+
+
+def test_measured_response_is_that_of_the_printed_controller(short):
+    """K of the paper, Tustin at 10 kHz, around D(s) with a held input and one sample of delay."""
+    from scipy.signal import cont2discrete
+
+    plant = cont2discrete(([1.0], [5.7e-8, 8.1e-6, 1.0]), H, "zoh")
+    k = cont2discrete(
+        ([230.0, 230 * 142.0, 230 * 1.8e7], np.polymul([1, 1.5], [1, 2132.0, 1.9e7])), H, "bilinear"
+    )
+    (bag,) = bags(short, "frequency_high_paper_22")
+    response = results.result(next(r.run for r in short[1] if r.run.bag == bag)).recording
+    from piezo_sim.experiment.analysis import frequency_response
+
+    measured = frequency_response(response)
+    z = np.exp(1j * measured.frequency * H)
+
+    def at(system):
+        return np.polyval(np.ravel(system[0]), z) / np.polyval(system[1], z)
+
+    loop = at(k) * at(plant)
+    expected = (
+        loop / z / (1 + loop / z)
+    )  # the sensor is one sample late, in the loop and in the bag
+    low = measured.frequency < 1000.0
+    np.testing.assert_allclose(np.abs(measured.gain[low]), np.abs(expected[low]), rtol=5e-3)
+
+
+def test_kinds_are_recognised(short):
+    for entry in short[1]:
+        kind = entry.run.case.analysis
+        if kind == "creep" or kind == "step" and entry.run.case.mode != "feedback":
+            kind = "transient"  # a shorter one; a step without feedback holds its voltage
+        assert classify(entry.recording) == kind, entry.run.case.name
+
+
+def test_wrong_kind_is_refused(short):
+    recording = short[1][0].recording
+    with pytest.raises(BagError, match="cannot be analysed as 'thermal'.*does not change"):
+        analyse(recording, "thermal")
+    with pytest.raises(BagError, match="needs two"):
+        analyse(recording, "hysteresis")
+
+
+def run_cli(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["experiment", *map(str, words)])
+    return cli.main()
+
+
+def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "step"
+    options = ("--engine", "--amplitude-um", 10, "--temperature", 25, 32, "--duration", 0.2)
+    assert run_cli(monkeypatch, "step", "--out", out, *options) == 1  # no warm-up within 0.2 s
+    assert "does not change" in capsys.readouterr().err
+    options = ("--engine", "--amplitude-um", 10, "--temperature", 25, 32, "--plant", "truth")
+    assert run_cli(monkeypatch, "step", "--out", out, *options) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run_cli(monkeypatch, "step", "--out", out, "--overwrite", *options) == 0
+    content = json.loads((out / "metrics.json").read_text())
+    assert [c["mode"] for c in content["cases"]] == [
+        m for m in ("open_loop", "feedforward", "feedback") for _ in (25, 32)
+    ]
+    assert {c["temperature_degc"] for c in content["cases"]} == {25.0, 32.0}
+    assert [c["reference_um"] for c in content["cases"]] == pytest.approx([10.0] * 6)
+    assert {c["plant"] for c in content["cases"]} == {"truth"}
+    assert content["thermal_step"]["temperature_change_degc"] == pytest.approx(7.0)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3 and "http" not in page
+
+    first, second = (out / "bags" / f"step_feedback_{t}degc" for t in (25, 32))
+    assert run_cli(monkeypatch, "analyse", first, "--out", tmp_path / "a") == 0
+    case = content["cases"][4]
+    assert f"{case['settling_time_5pct_ms']:.1f}" in capsys.readouterr().out
+    assert run_cli(monkeypatch, "compare", first, second, "--out", tmp_path / "c") == 0
+    change = content["cases"][5]["rise_time_ms"] - case["rise_time_ms"]
+    assert f"{change:.2f}" in capsys.readouterr().out
+    other = out / "bags" / "thermal_step_feedback"
+    assert run_cli(monkeypatch, "compare", first, other, "--out", tmp_path / "c") == 1
+    assert "different kinds" in capsys.readouterr().err
+    assert run_cli(monkeypatch, "analyse", out, "--out", tmp_path / "a") == 1
+    assert "no .mcap or .db3 file" in capsys.readouterr().err
+
+
+def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "none"
+    for words, message in (
+        (("--controller", "unheard_of"), "feedback_unheard_of.yaml"),
+        (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
+        (("--duration", -1.0), "'duration' is -1.0, must be a number above 0.0"),
+        (("--temperature", 400.0), "base_degc"),
+    ):
+        assert run_cli(monkeypatch, "step", "--engine", "--out", out, *words) == 2
+        assert message in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_profile_names_what_is_wrong():
+    with pytest.raises(ParameterError, match="here: shape is 'square'"):
+        profile({"shape": "square"}, "um", "here")
+    with pytest.raises(ParameterError, match="here: shape 'step' needs 'amplitude_um'"):
+        profile({"shape": "step", "amplitude_v": 1.0}, "um", "here")
+    with pytest.raises(ParameterError, match="does not know .'begin'"):
+        profile({"shape": "step", "amplitude_um": 1.0, "begin": 0.1}, "um", "here")
+    with pytest.raises(ParameterError, match="must increase"):
+        profile({"shape": "points", "time": [1.0, 0.0], "value_um": [0.0, 1.0]}, "um", "here")
+
+
+def test_multisine_has_the_lines_it_says():
+    time, wave = multisine(period=0.5, highest_rad_s=1000.0, lines=8, spacing=1e-3)
+    assert time.size == 1000 and np.max(np.abs(wave)) == pytest.approx(1.0)
+    strength = np.abs(np.fft.rfft(wave[:500])) / 250
+    lines = np.flatnonzero(strength > 1e-9)
+    assert lines[0] == 1 and lines[-1] == int(1000.0 * 0.5 / (2 * np.pi)) == 79
+    np.testing.assert_allclose(strength[lines], strength[1], rtol=1e-9)
+
+
+def test_every_figure_has_a_heading(short):
+    assert set().union(*(r.figures for r in short[1])) <= set(QUANTITIES)
