@@ -27,7 +27,7 @@ from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.processes import NodeProcesses
 
 HERE = Path(__file__).resolve().parent
-ROUNDS = 5
+ROUNDS = 3
 SECONDS = 3.0  # of one measurement
 WARM_UP = 0.5  # s at full rate before it
 LOOP = ("temperature", "feedforward", "feedback", "cantilever")

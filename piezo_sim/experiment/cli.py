@@ -17,9 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from piezo_control.parameters import ParameterError
 from piezo_control.recording import BagError
-from piezo_sim.experiment import paper, results
 from piezo_sim.experiment.analysis import ANALYSES
-from piezo_sim.experiment.bags import analyse_bags, compare_bags, recordings
 from piezo_sim.experiment.cases import Case, read_experiment
 from piezo_sim.experiment.conductor import RunFailed
 from piezo_sim.experiment.engine_runner import run_on_engine
@@ -71,6 +69,9 @@ def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -
     )  # fmt: skip
     with Progress(*columns, console=console) as progress:
         runs = list(run_all(cases, out, arguments.namespace, progress))
+        # Imported here: matplotlib takes half a second, which the first sample need not wait for.
+        from piezo_sim.experiment import paper, results
+
         runs.sort(key=lambda run: cases.index(run.case))
         task = progress.add_task("analysis of the bags", total=len(runs))
         found = [results.result(run) for run in progress.track(runs, task_id=task)]
@@ -96,6 +97,8 @@ def run_all(cases: Sequence[Case], out: Path, namespace: str, progress: Progress
 
 def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> None:
     """Analyse bags one by one."""
+    from piezo_sim.experiment.bags import analyse_bags
+
     found = _read_bags(arguments)
     prepare(out, overwrite=True)
     sections = analyse_bags(found, arguments.kind, out)
@@ -105,6 +108,8 @@ def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> N
 
 def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> None:
     """Compare bags in one plot and one table."""
+    from piezo_sim.experiment.bags import compare_bags
+
     found = _read_bags(arguments)
     prepare(out, overwrite=True)
     section = compare_bags(found, arguments.kind, out)
@@ -113,6 +118,8 @@ def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> N
 
 
 def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
+    from piezo_sim.experiment.bags import recordings
+
     return recordings(arguments.bags, arguments.finger, arguments.run, arguments.partial)
 
 
