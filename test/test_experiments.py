@@ -103,10 +103,10 @@ def test_fig_4(short, lines):
     assert lines[key]["values"]["none"] == pytest.approx([crept[1] / crept[0]], rel=0.02)
 
 
-def cycle(bag, drive):
-    """Time, drive and deflection from the maximum at 0.25 s to that at 1.25 s of a 1 Hz sine."""
+def last_cycle(bag, drive, begin):
+    """Drive and deflection from the maximum at `begin` (s) to the next one of a 1 Hz sine."""
     recording = read(bag)
-    inside = (recording.time > 0.25 - 1e-6) & (recording.time < 1.25 + 1e-6)
+    inside = (recording.time > begin - 1e-6) & (recording.time < begin + 1.0 + 1e-6)
     return getattr(recording, drive)[inside], raw(bag, "deflection")[1][inside]
 
 
@@ -122,7 +122,7 @@ def width(drive, value):
 
 
 def test_fig_5(short, lines):
-    loops = [cycle(bag, "voltage") for bag in bags(short, "hysteresis")]
+    loops = [last_cycle(bag, "voltage", 0.25) for bag in bags(short, "hysteresis")]
     spread = [(max(y) - min(y)) * 1e6 for _, y in loops]
     percent = [100 * width(x, y) / np.ptp(y) for x, y in loops]
     values = {k: line["values"].get("none") for k, line in lines.items()}
@@ -133,7 +133,7 @@ def test_fig_5(short, lines):
 
 
 def test_fig_9(short, lines):
-    loops = [cycle(bag, "reference") for bag in bags(short, "feedforward")]
+    loops = [last_cycle(bag, "reference", 1.25) for bag in bags(short, "feedforward")]
     slopes = [
         np.sum((x - x.mean()) * (y - y.mean())) / np.sum((x - x.mean()) ** 2) for x, y in loops
     ]
