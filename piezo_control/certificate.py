@@ -58,8 +58,8 @@ class Figures(NamedTuple):
 class Box:
     """The uncertainty box of a problem, sampled; prepared once for many controllers.
 
-    `resonance`, `damping` and `gain` are the numbers of values along each side, `points` that of
-    frequencies. `spread` replaces the problem's relative range of the resonance.
+    `resonance`, `damping` and `gain` are the numbers of values along each side (odd; the middle one is
+    nominal), `points` that of frequencies. `spread` replaces the problem's relative range of the resonance.
     """
 
     def __init__(
@@ -169,10 +169,16 @@ def _sample_box(
         problem.finger.denominator,
         problem.finger.sample_time,
         problem.finger.delay_samples,
-        np.linspace(1.0 - spread, 1.0 + spread, resonance),
-        np.geomspace(u.damping_low, u.damping_high, damping),
-        np.linspace(1.0 - u.gain, 1.0 + u.gain, gain),
+        _around_one(1.0 - spread, 1.0 + spread, resonance),
+        _around_one(u.damping_low, u.damping_high, damping),
+        _around_one(u.gain_low, u.gain_high, gain),
     )
+
+
+def _around_one(low: float, high: float, count: int) -> np.ndarray:
+    """Return an odd number of factors from `low` to `high`, the middle one being 1."""
+    half = count // 2 + 1
+    return np.concatenate([np.geomspace(low, 1.0, half), np.geomspace(1.0, high, half)[1:]])
 
 
 # Norms ----------------------------------------------------------------------------------------

@@ -51,7 +51,8 @@ class Uncertainty:
     )
     damping_low: float = parameter(0.5, "smallest factor on the damping ratio", low=0.01, high=1.0)
     damping_high: float = parameter(2.0, "largest factor on the damping ratio", low=1.0, high=100.0)
-    gain: float = parameter(0.1, "relative, to both sides", low=0.0, high=0.9)
+    gain_low: float = parameter(0.9, "smallest factor on the loop gain", low=0.01, high=1.0)
+    gain_high: float = parameter(1.1, "largest factor on the loop gain", low=1.0, high=100.0)
 
     def __post_init__(self) -> None:
         if self.resonance_stable < self.resonance:
