@@ -37,7 +37,7 @@ PARAMS = {
     "feedback": "feedback_paper.yaml",
     "cantilever": "cantilever.yaml",
 }
-RATES_HZ = (100, 200, 500, 1000, 2000, 3000, 4000, 5000, 7000, 10000)
+RATES_HZ = (20, 50, 100, 200, 500, 1000, 2000, 5000)
 STEADY = 0.999  # share of the periods
 TOLERANCE = 0.1  # of the sample time
 

@@ -13,6 +13,7 @@ publishers still alive.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
@@ -46,6 +47,7 @@ def stop_event() -> threading.Event:
 
 def spin(nodes: list[Node], done: Callable[[], bool]) -> None:
     """Serve the events of `nodes` in this thread until `done()`, looked at after every event."""
+    gc.freeze()  # modules and entities stay; the collector need not visit them between samples
     executor = EventsExecutor()
     for node in nodes:
         executor.add_node(node)

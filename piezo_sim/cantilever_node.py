@@ -32,7 +32,7 @@ from piezo_sim.cantilever import Cantilever, CantileverParameters
 from piezo_sim.temperature import grid_index
 
 STATE_PERIOD = 0.1  # s
-JITTER_WINDOW = 10000  # periods
+JITTER_WINDOW = 1000  # periods: to sort more takes longer than a period
 RETRY_PERIOD = 0.1  # s
 
 
