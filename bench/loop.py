@@ -98,10 +98,15 @@ def arguments(name: str, finger: str, **parameters: Any) -> list[str]:
     """Return the command-line arguments of node `name` in namespace `finger`."""
     words = ["--ros-args", "-r", f"__ns:=/{finger}"]
     if name in PARAMS:
-        words += ["--params-file", str(params_folder() / PARAMS[name])]
+        words += arguments_file(PARAMS[name])
     for key, value in parameters.items():
         words += ["-p", f"{key}:={value}"]
     return words
+
+
+def arguments_file(file: str) -> list[str]:
+    """Return the arguments that load a shipped parameter file."""
+    return ["--params-file", str(params_folder() / file)]
 
 
 def finger(name: str, log: Path, **parameters: Any) -> NodeProcesses:
@@ -140,20 +145,26 @@ def ring(hops: int, seconds: float) -> float:
 
 
 def lockstep(log: Path) -> list[dict[str, Any]]:
-    """The loop's rate against the same nodes on the default executor and against a bare ring."""
-    ours, default, bare = [], [], []
+    """The loop's rate against the default executor, a bare ring, and the nodes in one process."""
+    ours, default, bare, composed = [], [], [], []
     for _ in range(ROUNDS):
         with observer() as watching, finger("finger", log):
             ours.append(watching.rate("finger"))
         with observer() as watching, default_executor("finger"):
             default.append(watching.rate("finger"))
         bare.append(ring(3, SECONDS))
+        files = [word for file in PARAMS.values() for word in arguments_file(file)]
+        one = {"finger": [*arguments("finger", "finger"), *files]}
+        with observer() as watching, NodeProcesses(one, log):
+            composed.append(watching.rate("finger"))
     value = statistics.median(ours)
     return [
         row("loop over topics, against rclpy's default executor", value, "samples/s",
             statistics.median(default)),
         row("loop over topics, against a bare ring of three hops", value, "samples/s",
             statistics.median(bare)),
+        row("loop in one process, against separate ones", statistics.median(composed),
+            "samples/s", value),
     ]  # fmt: skip
 
 
