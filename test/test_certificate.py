@@ -1,0 +1,287 @@
+"""The certificate against python-control, the paper's figures, and claims that are not true."""
+
+import dataclasses
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+import yaml
+
+from piezo_control import synthesis
+from piezo_control.certificate import (
+    Box,
+    certify,
+    nominal_figures,
+    stable_resonances,
+    weighted_norms,
+)
+from piezo_control.design_problem import DesignProblem, Uncertainty
+from piezo_control.feedback import FeedbackParameters
+from piezo_control.parameters import build, load
+from piezo_control.synthesis import synthesize
+from piezo_control.synthesize import main, read_problem
+
+PARAMS = Path(__file__).resolve().parents[1] / "params"
+
+
+def problem(name: str) -> DesignProblem:
+    path = PARAMS / f"synthesis_{name}.yaml"
+    return build(DesignProblem, load(path, "synthesize"), str(path))
+
+
+def shipped(name: str) -> FeedbackParameters:
+    path = PARAMS / f"feedback_{name}.yaml"
+    return build(FeedbackParameters, load(path, "feedback"), str(path))
+
+
+def paper_setting() -> DesignProblem:
+    """The printed controller as in the paper: practically continuous (50 kHz), no delay."""
+    p = problem("paper")
+    return dataclasses.replace(
+        p, finger=dataclasses.replace(p.finger, sample_time=2e-5, delay_samples=0)
+    )
+
+
+# Norms ------------------------------------------------------------------------------------------
+
+
+def test_weighted_norm_equals_that_of_the_interconnection_in_python_control():
+    p = problem("robust")
+    step = p.finger.sample_time / synthesis.TIME_UNIT
+    design = synthesize(p)
+    plant = synthesis.generalised_plant(
+        synthesis.to_w_plane(synthesis.delayed_finger(p.finger), step),
+        *synthesis.realised_weights(p.weights),
+    )
+    c = design.controller
+    order = c.order - 2  # without the prefilter, which is outside the loop
+    discrete = synthesis.StateSpace(
+        c.matrix("a")[:order, :order],
+        c.matrix("b")[:order, None],
+        c.matrix("c")[None, :order],
+        np.array([[c.d]]),
+    )
+    loop = control.ss(*plant).lft(control.ss(*synthesis.to_w_plane(discrete, step)), 1, 1)
+    expected = control.system_norm(loop, "inf", tol=1e-8)
+    assert weighted_norms(p, c)["all"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_papers_weighted_norm():
+    # |[W1 S, W1 S W2]| with W2 = 1 is sqrt 2 |W1 S| = 1.93 for the printed K (recomputed for this
+    # project's control reference; the paper claims gamma = 4). Effort weight 0: S alone.
+    p = dataclasses.replace(
+        paper_setting(),
+        method="hinf",
+        controller=synthesis.TransferFunction(),
+        weights=problem("paper_weights").weights,
+    )
+    printed = synthesize(paper_setting()).controller
+    assert math.sqrt(2.0) * weighted_norms(p, printed)["performance"] == pytest.approx(
+        1.93, abs=0.01
+    )
+
+
+def test_norms_of_an_unstable_loop_are_infinite():
+    unstable = dataclasses.replace(shipped("robust"), d=50.0)
+    assert weighted_norms(problem("robust"), unstable)["all"] == math.inf
+    row = certify(problem("robust"), unstable, 0.9).rows[0]
+    assert not row.met
+    assert row.worst > 1.0
+
+
+# Claims -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factor", [0.07, 0.5, 2.0, 100.0])
+def test_a_falsified_gamma_is_found_out(factor):
+    design = synthesize(problem("robust"))
+    assert certify(design.problem, design.controller, design.gamma).met
+    falsified = certify(design.problem, design.controller, factor * design.gamma)
+    assert [row.specification for row in falsified.rows if not row.met] == [
+        "weighted norm is the solver's gamma"
+    ]
+
+
+def test_junk_from_the_solver_is_found_out():
+    # python-control's hinfsyn on the paper's singular problem: gamma 0.065, true norm 2.1e3 (project's
+    # control reference). Any controller that does not fit its claim must fail, whatever it claims.
+    design = synthesize(problem("robust"))
+    rng = np.random.default_rng(5)
+    junk = dataclasses.replace(
+        design.controller,
+        c=tuple(float(x) for x in 1e-3 * rng.standard_normal(design.controller.order)),
+    )
+    assert not certify(design.problem, junk, 0.065).met
+
+
+# The paper --------------------------------------------------------------------------------------
+
+
+def test_the_papers_controller_in_the_papers_setting():
+    # Control reference of this project: 13.3 ms, 226 rad/s, 0.68 %, unstable with the resonance 20 %
+    # lower; all of them differ from what the paper says about itself.
+    p = paper_setting()
+    controller = synthesize(p).controller
+    found = nominal_figures(p, controller)
+    assert found["settling_final"] == pytest.approx(13.3e-3, abs=0.3e-3)
+    assert found["bandwidth"] == pytest.approx(226.0, abs=3.0)
+    assert found["sensitivity_static"] == pytest.approx(0.0068, abs=5e-5)
+    low, _ = stable_resonances(p, controller)
+    assert 0.80 < low < 0.85
+    certificate = certify(p, controller)
+    failed = {row.specification: row for row in certificate.rows if not row.met}
+    assert "resonance -20 %" in failed["poles with resonance further off"].at
+
+
+def test_the_papers_weights_give_the_behaviour_of_its_controller():
+    p = problem("paper_weights")
+    design = synthesize(p)
+    found = nominal_figures(p, design.controller)
+    assert design.gamma == pytest.approx(4.0, abs=0.1)
+    assert found["settling_final"] == pytest.approx(13.3e-3, abs=0.3e-3)
+    assert found["bandwidth"] == pytest.approx(226.0, abs=3.0)
+    assert found["sensitivity_static"] == pytest.approx(0.0068, abs=1e-4)
+    # Its zeros cancel the resonance: a force rings on at nearly 1 / (2 zeta) = 29.5.
+    assert found["disturbance_peak"] > 25.0
+
+
+# Shipped controllers ----------------------------------------------------------------------------
+
+
+def test_robust_meets_everything_at_once():
+    # The figures of the project's issue: what a brute-force integrator with roll-off and broad notch
+    # reaches in the worst case over resonance ±10 %, damping x0.5 to x2 and gain ±10 %.
+    p = dataclasses.replace(problem("robust"), uncertainty=Uncertainty())
+    certificate = certify(p, shipped("robust"), synthesize(p).gamma)
+    assert certificate.met
+    worst, outer = certificate.worst, certificate.outer
+    assert worst["settling"] <= 5.5e-3
+    assert worst["overshoot"] <= 0.0049
+    assert worst["sensitivity_peak"] <= 1.53
+    assert worst["static_error"] <= 5e-4
+    assert worst["force_settling"] <= 15e-3
+    assert outer["settling"] <= 6.9e-3
+    assert outer["sensitivity_peak"] < 2.0
+
+
+@pytest.mark.parametrize("name", ["robust", "pid", "integrator_notch"])
+def test_shipped_controllers_say_what_the_certificate_says(name):
+    controller = shipped(name)
+    gamma = synthesize(problem(name)).gamma if name == "robust" else math.nan
+    assert certify(problem(name), controller, gamma).met is controller.certified is True
+
+
+def test_the_papers_controller_is_shipped_as_not_certified():
+    assert not shipped("paper").certified
+    assert not certify(problem("paper"), shipped("paper")).met
+
+
+def test_worst_case_is_worst_for_fingers_in_between():
+    # No finger drawn from the box is worse than the certificate's grid, but for a small remainder.
+    p = problem("robust")
+    grid = certify(p, shipped("robust"), 1.0).worst
+    rng = np.random.default_rng(11)
+    u = p.uncertainty
+    for _ in range(30):
+        factors = {
+            "resonance": 1.0 + u.resonance * rng.uniform(-1, 1),
+            "damping": math.exp(rng.uniform(math.log(u.damping_low), math.log(u.damping_high))),
+            "gain": rng.uniform(u.gain_low, u.gain_high),
+        }
+        a2, a1, _ = p.finger.denominator
+        moved = dataclasses.replace(
+            p,
+            finger=dataclasses.replace(
+                p.finger,
+                denominator=(
+                    a2 / factors["resonance"] ** 2,
+                    a1 * factors["damping"] / factors["resonance"],
+                    1.0,
+                ),
+            ),
+            uncertainty=Uncertainty(
+                0.0,
+                0.0,
+                1.0,
+                1.0,
+                factors["gain"] if factors["gain"] < 1 else 1.0,
+                max(factors["gain"], 1.0),
+            ),
+        )
+        found = Box(moved, resonance=1, damping=1, gain=3, points=1200).figures(shipped("robust"))
+        for name in ("settling", "overshoot", "sensitivity_peak", "force_settling"):
+            assert getattr(found, name).max() <= 1.02 * grid[name] + 1e-4
+
+
+# Command line -----------------------------------------------------------------------------------
+
+
+def test_from_specifications_to_a_certified_file(tmp_path):
+    # As a program of its own, like a user starts it: within ten seconds on the machines of the project.
+    out = tmp_path / "controller.yaml"
+    code = "import sys; from piezo_control.synthesize import main; sys.exit(main())"
+    arguments = ["params/specifications.yaml", "--out", str(out), "--report", str(tmp_path)]
+    subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=PARAMS.parent, check=True, timeout=60
+    )
+    controller = build(FeedbackParameters, load(out, "feedback"))
+    assert controller.certified
+    assert json.loads((tmp_path / "certificate.json").read_text())["met"]
+    # The complete problem, weights included, gives the same controller again.
+    again = build(DesignProblem, load(tmp_path / "problem.yaml", "synthesize"))
+    assert synthesize(again).controller.a == pytest.approx(controller.a, abs=1e-6)
+    for picture in ("sensitivities", "nyquist", "steps", "poles"):
+        assert (tmp_path / f"{picture}.png").stat().st_size > 10_000
+
+
+@pytest.fixture
+def command_line(tmp_path, monkeypatch):
+    """Run the command line in this process and return its exit code."""
+
+    def run(*arguments: str) -> int:
+        words = ["synthesize", *arguments, "--report", str(tmp_path / "report")]
+        monkeypatch.setattr(sys, "argv", words)
+        return main()
+
+    return run
+
+
+def test_what_fails_is_only_written_by_force_and_says_so(tmp_path, command_line, capsys):
+    out = tmp_path / "controller.yaml"
+    paper = str(PARAMS / "synthesis_paper.yaml")
+    assert command_line(paper, "--out", str(out)) == 1
+    assert "NOT certified" in capsys.readouterr().err
+    assert not out.exists()
+    assert command_line(paper, "--out", str(out), "--force") == 1
+    assert "NOT CERTIFIED" in out.read_text().splitlines()[0]
+    assert not build(FeedbackParameters, load(out, "feedback")).certified
+
+
+def test_unusable_input_is_named(tmp_path, command_line, capsys):
+    content = yaml.safe_load((PARAMS / "synthesis_robust.yaml").read_text())
+    content["/**/synthesize"]["ros__parameters"]["weights"]["effort"]["numerator"] = [0.0, 0.0, 1.0]
+    path = tmp_path / "problem.yaml"
+    path.write_text(yaml.safe_dump(content))
+    assert command_line(str(path)) == 2
+    assert "D12 = 0" in capsys.readouterr().err
+    content["/**/synthesize"]["ros__parameters"]["order"] = -1
+    path.write_text(yaml.safe_dump(content))
+    assert command_line(str(path)) == 2
+    message = capsys.readouterr().err
+    assert "'order' is -1" in message
+    assert str(path) in message
+
+
+def test_an_identified_finger_replaces_that_of_the_problem(tmp_path):
+    identified = tmp_path / "cantilever.yaml"
+    plant = {"dynamics": {"denominator": [6e-8, 9e-6, 1.0]}, "sample_time": 5e-5}
+    identified.write_text(yaml.safe_dump({"/**/cantilever": {"ros__parameters": plant}}))
+    p = read_problem(PARAMS / "synthesis_robust.yaml", identified)
+    assert p.finger.denominator == (6e-8, 9e-6, 1.0)
+    assert p.finger.sample_time == 5e-5
+    assert p.finger.delay_samples == 1
