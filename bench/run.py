@@ -101,7 +101,7 @@ def main() -> int:
     out = parser.parse_args().out
     out.parent.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    console = Console()
+    console = Console(width=140)
     rows: list[dict[str, Any]] = []
     histograms: dict[str, np.ndarray] = {}
     with tempfile.TemporaryDirectory() as folder:
