@@ -41,16 +41,18 @@ GAMMA_AGREEMENT = 1.05
 class Figures(NamedTuple):
     """Figures of every finger of a box, arrays with shape (nfingers,); infinite when unstable.
 
-    `settling`, `overshoot` and `static_error` belong to a reference step, the others are the largest
-    |S| and |K S|, how long a force step leaves more than 5 % of its open-loop static deflection (s)
-    and the largest deflection after a temperature step (m/°C).
+    `settling`, `overshoot` and `static_error` belong to a reference step; the peaks are those of |S|,
+    |T|, |K S| and |G S|; `force_settling` is how long a force step leaves more than 5 % of its open-loop
+    static deflection (s), `drift` the largest deflection after a temperature step (m/°C).
     """
 
     settling: np.ndarray
     overshoot: np.ndarray
     static_error: np.ndarray
     sensitivity_peak: np.ndarray
+    complementary_peak: np.ndarray
     effort_peak: np.ndarray
+    disturbance_peak: np.ndarray
     force_settling: np.ndarray
     drift: np.ndarray
 
@@ -105,7 +107,9 @@ class Box:
                 overshoot=np.maximum(step.max(axis=1) - 1.0, 0.0),
                 static_error=np.abs(1.0 - static_gain(loop)),
                 sensitivity_peak=np.abs(sensitivity).max(axis=1),
+                complementary_peak=np.abs(1.0 - sensitivity).max(axis=1),
                 effort_peak=np.abs(feedback * sensitivity).max(axis=1),
+                disturbance_peak=np.abs(self.plant * sensitivity).max(axis=1),
                 force_settling=settling(force, self.fingers.sample_time, 0.0, STEP_BAND),
                 drift=self.drift(loop),
             )
@@ -382,9 +386,8 @@ def nominal_figures(problem: DesignProblem, controller: FeedbackParameters) -> d
     """Return what only the nominal loop is asked for.
 
     ``bandwidth`` is where the response from reference to reading falls below -3 dB of its static
-    value for the first time (rad/s), ``sensitivity_static`` is S(1), ``complementary_peak`` and
-    ``disturbance_peak`` the largest |T| and |G S|, ``settling_2`` the settling time into 2 %,
-    ``settling_final`` that into 5 % around the final value. ``resonance_low`` and
+    value for the first time (rad/s), ``sensitivity_static`` is S(1), ``settling_2`` the settling time
+    into 2 %, ``settling_final`` that into 5 % around the final value. ``resonance_low`` and
     ``resonance_high`` are the factors on the resonance between which the loop is stable, in steps
     of 0.005 and within 0.4 to 1.6.
     """
@@ -409,8 +412,6 @@ def nominal_figures(problem: DesignProblem, controller: FeedbackParameters) -> d
     return {
         "bandwidth": float(frequency[below[0]]) if below.size else math.inf,
         "sensitivity_static": abs(1.0 - final),
-        "complementary_peak": float(np.abs(feedback * plant * sensitivity).max()),
-        "disturbance_peak": float(np.abs(plant * sensitivity).max()),
         "settling_2": float(settling(step, model.sample_time, 1.0, 0.02)[0]),
         "settling_final": float(settling(step, model.sample_time, final, 0.05 * abs(final))[0]),
         "resonance_low": low,

@@ -149,7 +149,10 @@ class DesignProblem:
     specification: Specification = group(Specification)
     weights: Weights = group(Weights)
     gamma_margin: float = parameter(
-        1.1, "gamma of the controller over the smallest one", low=1.001, high=100.0
+        1.5,
+        "gamma of the controller over the smallest one; more than 1 rolls off at high frequency",
+        low=1.001,
+        high=100.0,
     )
     integrator: bool = parameter(True, "make the controller's slowest pole an exact integrator")
     order: int = parameter(0, "order to reduce to, without the prefilter; 0: not reduced", low=0)

@@ -48,7 +48,7 @@ GAMMA_TOLERANCE = 0.01
 FASTEST_POLE = 1e5
 """Per sample, in the w-plane; what is faster comes from a singular problem."""
 ANTI_WINDUP_NOISE = 1e-3
-TUNING_EVALUATIONS = 300
+TUNING_EVALUATIONS = 250
 TUNING_RESERVE = 0.95
 """Part of each specification that tuning uses: the certificate looks at more fingers than it does."""
 
@@ -160,7 +160,9 @@ def realise(transfer: TransferFunction) -> StateSpace:
     """Return a realisation in the inner time unit."""
 
     def scaled(coefficients: Sequence[float]) -> np.ndarray:
-        return np.array(coefficients) / TIME_UNIT ** np.arange(len(coefficients))[::-1]
+        units = TIME_UNIT ** np.arange(len(coefficients))[::-1]
+        trimmed = np.trim_zeros(np.array(coefficients) / units, "f")
+        return trimmed if trimmed.size else np.zeros(1)
 
     order = len(transfer.denominator) - 1
     if order == 0:  # tf2ss would invent an integrator
