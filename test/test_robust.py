@@ -44,7 +44,7 @@ def step_response(plant: CantileverParameters, degc: float, height: float):
     return step_metrics(time, done.deflection[STEP_AT:], height)
 
 
-def test_the_finger_is_the_issues():
+def test_rate_delay_and_resolution_are_those_asked_for():
     assert NOMINAL.sample_time == 1e-4
     assert NOMINAL.sensor.delay_samples == 1
     assert NOMINAL.sensor.resolution == 10e-9
@@ -62,7 +62,7 @@ def test_full_step(degc):
 @pytest.mark.parametrize("degc", [22.0, 32.0])
 def test_worst_case_of_the_box(degc):
     # 18 µm: with a gain 10 % too small 20 µm are out of reach of 40 V. The limits are those of the
-    # brute-force design in the project's issue, one sample more for the metric that counts samples.
+    # brute-force integrator with roll-off and notch, one sample more: this metric counts samples.
     found = [step_response(finger(*factors), degc, 18e-6) for factors in BOX]
     assert max(m.settling_5_reference_s for m in found) <= 5.6e-3
     assert max(m.overshoot for m in found) <= 0.0049
