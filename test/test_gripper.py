@@ -316,7 +316,7 @@ def test_finger_that_stops_aborts_the_goal_and_stays_at_rest(bench):
     bench.result_of(change.call_async(request))
     answer = bench.result_of(handle.get_result_async())
     assert answer.status == GoalStatus.STATUS_ABORTED
-    assert bench.states["right"].phase == FingerState.FAULT
+    bench.wait(lambda: bench.states["right"].phase == FingerState.FAULT)
     assert "finger 'right' is FAULT (no answer to sample" in bench.log.read_text()
     left, right = bench.held()
     assert right == 0.0

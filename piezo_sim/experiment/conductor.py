@@ -22,6 +22,7 @@ from piezo_gripper_msgs.msg import FingerState, RecorderState
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 SERVICE_TIMEOUT = 20.0  # s
+SERVICE_RETRY = 1.0  # s
 
 
 class RunFailed(RuntimeError):
@@ -87,7 +88,6 @@ class Conductor:
         A node takes all of its parameters or, raising RunFailed with the node's reason, none.
         """
         self._to_unconfigured()
-        answers = {}
         for name, values in parameters.items():
             request = SetParametersAtomically.Request()
             kinds = declarations(type(values))
@@ -96,20 +96,17 @@ class Conductor:
                 .to_parameter_msg()
                 for n, v in flatten(values).items()
             ]  # fmt: skip
-            answers[name] = self._call(name, "set_parameters_atomically", request)
-        for name, answer in answers.items():
-            result = self._result(answer, f"parameters of {name}").result
+            result = self._insist(name, "set_parameters_atomically", request).result
             if not result.successful:
                 raise RunFailed(f"node '{name}' refused its parameters: {result.reason}")
         self._transition(self.names, Transition.TRANSITION_CONFIGURE, "configure")
 
     def _to_unconfigured(self) -> None:
-        states = {n: self._call(n, "get_state", GetState.Request()) for n in self.names}
+        states = {n: self._insist(n, "get_state", GetState.Request()) for n in self.names}
         inactive = [
             name
             for name, answer in states.items()
-            if self._result(answer, f"state of {name}").current_state.id
-            == State.PRIMARY_STATE_INACTIVE
+            if answer.current_state.id == State.PRIMARY_STATE_INACTIVE
         ]
         self._transition(inactive, Transition.TRANSITION_CLEANUP, "clean up")
 
@@ -136,6 +133,22 @@ class Conductor:
         for name, answer in answers.items():
             if not self._result(answer, f"{verb} {name}").success:
                 raise RunFailed(f"node '{name}' would not {verb}; its log says why")
+
+    def _insist(self, name: str, service: str, request: Any) -> Any:
+        """Call a service whose request may be repeated, again each second until it answers.
+
+        A node that has not discovered the client's half of the service yet cannot send its response.
+        """
+        calls = [self._call(name, service, request)]
+        begin = time.monotonic()
+
+        def answered() -> bool:
+            if time.monotonic() - begin > len(calls) * SERVICE_RETRY:
+                calls.append(self._call(name, service, request))
+            return any(call.done() for call in calls)
+
+        self.wait(answered, SERVICE_TIMEOUT, f"service {name}/{service}")
+        return next(call.result() for call in calls if call.done())
 
     def _call(self, name: str, service: str, request: Any) -> Future:
         return self._clients[name, service].call_async(request)
