@@ -84,6 +84,11 @@ def feedforward_step(c: FeedforwardCoefficients, s: FeedforwardState, command: f
     return voltage
 
 
+def toward_zero(voltage: float, step: float) -> float:
+    """Return `voltage` (V) one `step` (V) closer to 0 V, or 0 V: one sample of a safe ramp."""
+    return math.copysign(max(abs(voltage) - step, 0.0), voltage)
+
+
 class Feedforward:
     """Feedforward law of one finger at a fixed `sample_time` (s), starting at 0 V and homed.
 

@@ -14,7 +14,7 @@ import math
 import time
 
 from piezo_control import finger_node
-from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters, toward_zero
 from piezo_control.parameters import parameter
 from piezo_control.sample_filter_node import SampleFilterNode, mode, subscribers
 from piezo_gripper_msgs.msg import Sample
@@ -83,7 +83,7 @@ class FeedforwardNode(SampleFilterNode):
         last = self.last.value
         voltage = Sample(number=self.last.number)
         voltage.header.stamp = self.get_clock().now().to_msg()
-        voltage.value = math.copysign(max(abs(last) - step, 0.0), last) if last else 0.0
+        voltage.value = toward_zero(last, step)
         self.law.follow(voltage.value)
         self.answers.publish(voltage)
         self.last = voltage

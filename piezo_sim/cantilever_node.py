@@ -22,6 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from piezo_control import finger_node
+from piezo_control.feedforward import toward_zero
 from piezo_control.finger_node import FingerNode
 from piezo_control.parameters import parameter
 from piezo_control.profile_input import ProfileInput
@@ -249,7 +250,7 @@ class CantileverNode(FingerNode):
         voltage = self.pending_voltage or 0.0
         if voltage and monotonic() - self.heard > p.hold_time:
             step = p.ramp * p.sample_time
-            voltage = math.copysign(max(abs(voltage) - step, 0.0), voltage)
+            voltage = toward_zero(voltage, step)
             self.pending_voltage = voltage
             self.text = f"no voltage for {p.hold_time:g} s: to 0 V"
         self.plant.advance(voltage, self.temperature, self.tip_force[self.number])
@@ -272,7 +273,7 @@ class CantileverNode(FingerNode):
         step = self.parameters.ramp * self.parameters.sample_time
         voltage = self.plant.voltage
         while voltage:
-            voltage = math.copysign(max(abs(voltage) - step, 0.0), voltage)
+            voltage = toward_zero(voltage, step)
             self.plant.advance(voltage, self.temperature, 0.0)
         self._enter(phase, text)
 

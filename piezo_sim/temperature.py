@@ -184,29 +184,23 @@ def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps (s, from the first one on) and temperatures of a bag's topic."""
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
+    from piezo_control.bag import BagError, open_bag
 
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            found = [c for c in reader.connections if c.topic == topic]
-            if not found:
-                topics = sorted({c.topic for c in reader.connections})
-                raise ParameterError(f"{path}: topic '{topic}' is missing; it has {topics}")
-            if found[0].msgtype != "sensor_msgs/msg/Temperature":
-                raise ParameterError(
-                    f"{path}: topic '{topic}' is of type {found[0].msgtype}, "
-                    "must be sensor_msgs/msg/Temperature"
-                )
-            nanoseconds = []
-            values = []
-            for connection, _, raw in reader.messages(connections=found):
-                message = reader.deserialize(raw, connection.msgtype)
-                stamp = message.header.stamp
-                nanoseconds.append(stamp.sec * 10**9 + stamp.nanosec)
-                values.append(message.temperature)
-    except (AnyReaderError, OSError) as error:
+        bag = open_bag(path)
+    except BagError as error:
         raise ParameterError(f"{path}: cannot be read as a bag: {error}") from None
+    if bag.damage:
+        raise ParameterError(f"{path}: cannot be read as a bag: {bag.damage}")
+    if topic not in bag.topics:
+        raise ParameterError(f"{path}: topic '{topic}' is missing; it has {bag.content()}")
+    try:
+        messages = bag.messages(topic, "sensor_msgs/msg/Temperature")
+    except BagError as error:
+        raise ParameterError(str(error)) from None
+    stamps = [m.header.stamp for m in messages]
+    nanoseconds = [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps]
+    values = [m.temperature for m in messages]
     bad = [n for n, value in enumerate(values) if not math.isfinite(value)]
     if bad or not values:
         what = f"message {bad[0]} is {values[bad[0]]} degC" if bad else "has no messages"
