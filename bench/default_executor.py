@@ -6,10 +6,10 @@ from importlib import import_module
 import rclpy
 
 MODULES = {
-    "cantilever": ("piezo_sim.cantilever_node", "CantileverNode"),
-    "temperature": ("piezo_sim.temperature_node", "TemperatureNode"),
-    "feedforward": ("piezo_control.feedforward_node", "FeedforwardNode"),
-    "feedback": ("piezo_control.feedback_node", "FeedbackNode"),
+    "cantilever": ("piezo_sim.nodes.cantilever", "CantileverNode"),
+    "temperature": ("piezo_sim.nodes.temperature", "TemperatureNode"),
+    "feedforward": ("piezo_control.nodes.feedforward", "FeedforwardNode"),
+    "feedback": ("piezo_control.nodes.feedback", "FeedbackNode"),
 }
 
 module, name = MODULES[sys.argv.pop(1)]

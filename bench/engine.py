@@ -23,8 +23,9 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters
 from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
-from piezo_sim import engine, monte_carlo
-from piezo_sim.cantilever import CantileverParameters
+from piezo_sim import engine
+from piezo_sim.experiment import monte_carlo
+from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -21,10 +21,10 @@ from engine import row
 from rcl_interfaces.srv import GetParameters
 from rclpy.experimental.events_executor import EventsExecutor
 
-from piezo_control.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
-from piezo_sim.experiment.processes import NodeProcesses
+from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 HERE = Path(__file__).resolve().parent
 ROUNDS = 3

@@ -11,7 +11,7 @@ import time
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 
-from piezo_control.qos import SAMPLE
+from piezo_control.nodes.qos import SAMPLE
 from piezo_gripper_msgs.msg import Sample
 
 WARM_UP = 0.5  # s

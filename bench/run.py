@@ -25,8 +25,8 @@ from engine import row
 from rich.console import Console
 
 from piezo_control.hysteresis import Hysteresis, HysteresisParameters
-from piezo_control.identification import equal_thresholds, identify_hysteresis
-from piezo_control.measurement import Measurement
+from piezo_control.identification.hysteresis import equal_thresholds, identify_hysteresis
+from piezo_control.identification.measurement import Measurement
 from piezo_sim.experiment.report import Section, print_table, write_html
 
 matplotlib.use("Agg")

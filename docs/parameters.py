@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-from piezo_control.feedback_node import FeedbackNode
-from piezo_control.feedforward_node import FeedforwardNode
-from piezo_control.finger_node import FingerNode, describe
+from piezo_control.nodes.base import FingerNode, describe
+from piezo_control.nodes.feedback import FeedbackNode
+from piezo_control.nodes.feedforward import FeedforwardNode
+from piezo_control.nodes.recorder import RecorderNode
 from piezo_control.parameters import declarations
-from piezo_sim.cantilever_node import CantileverNode
-from piezo_sim.recorder_node import RecorderNode
-from piezo_sim.temperature_node import TemperatureNode
+from piezo_sim.nodes.cantilever import CantileverNode
+from piezo_sim.nodes.temperature import TemperatureNode
 
 NODES = (CantileverNode, TemperatureNode, FeedforwardNode, FeedbackNode, RecorderNode)
 LONGEST = 40  # characters of a default that a table still shows

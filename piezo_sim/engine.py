@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from piezo_control import dynamics, hysteresis
 from piezo_control import feedback as feedback_law
 from piezo_control import feedforward as feedforward_law
-from piezo_control import hysteresis
 from piezo_control.feedback import (
     FeedbackCoefficients,
     FeedbackParameters,
@@ -40,9 +40,19 @@ from piezo_control.feedforward import (
 )
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
-from piezo_control.recording import Recording
-from piezo_sim import amplifier, cantilever, contact, creep, dynamics, sensor, thermal, truth
-from piezo_sim.cantilever import (
+from piezo_control.recording.recording import Recording
+from piezo_sim.plant import (
+    amplifier,
+    cantilever,
+    contact,
+    creep,
+    sensor,
+    thermal,
+)
+from piezo_sim.plant import (
+    bouc_wen as truth,
+)
+from piezo_sim.plant.cantilever import (
     CantileverModel,
     CantileverParameters,
     CantileverState,

@@ -184,7 +184,7 @@ def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps (s, from the first one on) and temperatures of a bag's topic."""
-    from piezo_control.bag import BagError, open_bag
+    from piezo_control.recording.reader import BagError, open_bag
 
     try:
         bag = open_bag(path)

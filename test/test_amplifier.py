@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from piezo_sim.amplifier import AmplifierParameters, amplify, discretize
+from piezo_sim.plant.amplifier import AmplifierParameters, amplify, discretize
 
 
 def respond(parameters, demands, sample_time=1e-4):

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.hysteresis import Hysteresis
 from piezo_control.parameters import build, load
-from piezo_sim.cantilever import Cantilever, CantileverParameters
-from piezo_sim.contact import ContactParameters
-from piezo_sim.creep import CreepParameters
-from piezo_sim.dynamics import DynamicsParameters
-from piezo_sim.sensor import SensorParameters
-from piezo_sim.thermal import ThermalParameters
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.plant.contact import ContactParameters
+from piezo_sim.plant.creep import CreepParameters
+from piezo_sim.plant.sensor import SensorParameters
+from piezo_sim.plant.thermal import ThermalParameters
 
 PARAMS = Path(__file__).parent.parent / "params"
 PERFECT = SensorParameters(resolution=0.0, noise=0.0, delay_samples=0)

@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import yaml
 
-from piezo_control import synthesis
-from piezo_control.certificate import (
+from piezo_control.design import synthesis
+from piezo_control.design.certificate import (
     Box,
     certify,
     nominal_figures,
     stable_resonances,
     weighted_norms,
 )
-from piezo_control.design_problem import DesignProblem, Uncertainty
+from piezo_control.design.cli import main, read_problem
+from piezo_control.design.problem import DesignProblem, Uncertainty
+from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.parameters import build, load
-from piezo_control.synthesis import synthesize
-from piezo_control.synthesize import main, read_problem
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"
 
@@ -230,7 +230,7 @@ def test_worst_case_is_worst_for_fingers_in_between():
 def test_from_specifications_to_a_certified_file(tmp_path):
     # As a program of its own, like a user starts it: within ten seconds on the machines of the project.
     out = tmp_path / "controller.yaml"
-    code = "import sys; from piezo_control.synthesize import main; sys.exit(main())"
+    code = "import sys; from piezo_control.design.cli import main; sys.exit(main())"
     arguments = ["params/specifications.yaml", "--out", str(out), "--report", str(tmp_path)]
     subprocess.run(
         [sys.executable, "-c", code, *arguments], cwd=PARAMS.parent, check=True, timeout=60

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from piezo_sim.contact import ContactParameters, contact_force, discretize, move_tip
-from piezo_sim.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters
+from piezo_sim.plant.contact import ContactParameters, contact_force, discretize, move_tip
 
 DYNAMICS = DynamicsParameters()
 A2, A1, _ = DYNAMICS.denominator

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from piezo_control.parameters import ParameterError
-from piezo_sim.creep import CreepParameters, creep, logarithmic
+from piezo_sim.plant.creep import CreepParameters, creep, logarithmic
 
 
 @pytest.mark.parametrize("sample_time", [1e-3, 0.1, 5.0])

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from piezo_control.drift_identification import identify_drift
 from piezo_control.hysteresis import HysteresisParameters
-from piezo_control.measurement import Measurement, MeasurementError
+from piezo_control.identification.drift import identify_drift
+from piezo_control.identification.measurement import Measurement, MeasurementError
 from piezo_control.profile import Profile
-from piezo_sim.cantilever import CantileverParameters
 from piezo_sim.engine import drive
+from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
 SAMPLE_TIME = 1e-2

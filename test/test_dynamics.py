@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
+from piezo_control.dynamics import DynamicsParameters, move, propagator
 from piezo_control.parameters import ParameterError
-from piezo_sim.dynamics import DynamicsParameters, move, propagator
 
 INERTIA, DAMPING, _ = DynamicsParameters().denominator
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from piezo_control.dynamics_identification import identify_dynamics
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
-from piezo_control.measurement import Measurement, MeasurementError
-from piezo_sim.cantilever import Cantilever, CantileverParameters
+from piezo_control.identification.dynamics import identify_dynamics
+from piezo_control.identification.measurement import Measurement, MeasurementError
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 
 SAMPLE_TIME = 1e-4
 # D(s) of the paper: 5.7e-8 s^2 + 8.1e-6 s + 1

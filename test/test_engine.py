@@ -14,9 +14,9 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
 from piezo_sim import engine
-from piezo_sim.cantilever import Cantilever, CantileverParameters
-from piezo_sim.contact import ContactParameters
-from piezo_sim.sensor import SensorParameters
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.plant.contact import ContactParameters
+from piezo_sim.plant.sensor import SensorParameters
 from piezo_sim.temperature import TemperatureParameters, temperature
 
 PARAMS = Path(__file__).parent.parent / "params"

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piezo_control.excitation import decaying_sine
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import Hysteresis, HysteresisParameters
+from piezo_control.identification.excitation import decaying_sine
 
 
 def test_amplitudes_fall_linearly_to_zero():

@@ -10,11 +10,11 @@ from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
 from piezo_control.parameters import ParameterError
-from piezo_control.recording import BagError, read
+from piezo_control.recording.recording import BagError, read
 from piezo_sim.experiment import cli, paper, results
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
 from piezo_sim.experiment.cases import multisine, profile, read_experiment
-from piezo_sim.experiment.engine_runner import run_on_engine
+from piezo_sim.experiment.on_engine import run_on_engine
 
 LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
 H = 1e-4

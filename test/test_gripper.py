@@ -27,8 +27,8 @@ from piezo_control.gripper import (
     force_of,
     opening_of,
 )
+from piezo_control.nodes.qos import LATCHED
 from piezo_control.parameters import ParameterError, build
-from piezo_control.qos import LATCHED
 from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState
 from piezo_gripper_msgs.msg import Profile as ProfileMessage

@@ -5,20 +5,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from piezo_control.excitation import decaying_sine
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
-from piezo_control.identification import (
+from piezo_control.identification.excitation import decaying_sine
+from piezo_control.identification.hysteresis import (
     equal_thresholds,
     identify_hysteresis,
     quality,
     settled,
 )
-from piezo_control.measurement import Measurement, MeasurementError, read_measurement
+from piezo_control.identification.measurement import Measurement, MeasurementError, read_measurement
 from piezo_control.parameters import ParameterError
-from piezo_sim.cantilever import Cantilever, CantileverParameters
-from piezo_sim.creep import CreepParameters
 from piezo_sim.engine import drive
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.plant.creep import CreepParameters
 from piezo_sim.temperature import TemperatureParameters
 
 P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"

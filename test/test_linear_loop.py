@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from piezo_control.feedback import Feedback, FeedbackParameters
-from piezo_control.linear_loop import (
+from piezo_control.design.linear_loop import (
     closed_loop,
     controller_response,
     finger_response,
@@ -20,6 +19,7 @@ from piezo_control.linear_loop import (
     spectral_radius,
     static_gain,
 )
+from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.metrics import settling_time
 from piezo_control.parameters import build, load
 

@@ -16,11 +16,11 @@ from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
 from piezo_control.profile import Profile
-from piezo_control.recording import read
+from piezo_control.recording.recording import read
 from piezo_sim import engine
 from piezo_sim.experiment.cases import NODES, Case
-from piezo_sim.experiment.processes import NodeDied
-from piezo_sim.experiment.runner import run_cases
+from piezo_sim.experiment.on_nodes.processes import NodeDied
+from piezo_sim.experiment.on_nodes.runner import run_cases
 
 SAMPLES = 600
 LOOP = ("deflection", "command", "voltage")
@@ -140,7 +140,7 @@ import sys
 from pathlib import Path
 from rich.progress import Progress
 from test_loop import closed_loop
-from piezo_sim.experiment.runner import run_cases
+from piezo_sim.experiment.on_nodes.runner import run_cases
 with Progress(disable=True) as progress:
     list(run_cases([closed_loop("run", 300)], Path(sys.argv[2]), sys.argv[1], progress))
 """

@@ -7,7 +7,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from piezo_control.measurement import Measurement, MeasurementError, read_measurement
+from piezo_control.identification.measurement import Measurement, MeasurementError, read_measurement
 
 SAMPLE = "piezo_gripper_msgs/msg/Sample"
 TEMPERATURE = "sensor_msgs/msg/Temperature"

@@ -10,9 +10,10 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import step_metrics
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
-from piezo_sim import engine, monte_carlo
-from piezo_sim.cantilever import CantileverParameters
-from piezo_sim.monte_carlo import CHUNK, Study, deviate
+from piezo_sim import engine
+from piezo_sim.experiment import monte_carlo
+from piezo_sim.experiment.monte_carlo import CHUNK, Study, deviate
+from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
 PARAMS = Path(__file__).parent.parent / "params"

@@ -19,11 +19,11 @@ from rclpy.parameter import Parameter
 
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import build, load
-from piezo_control.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
-from piezo_sim.experiment.processes import NodeProcesses
+from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 20.0  # s, generous: the tests wait on conditions

@@ -9,10 +9,10 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.profile import Profile
-from piezo_control.qos import LATCHED, SAMPLE
-from piezo_control.recording import SAMPLE_TYPE, BagError, Recording, read
-from piezo_sim.bag_writer import LITTLE_ENDIAN, SAMPLE_CDR, BagWriter, write_recording
+from piezo_control.recording.recording import SAMPLE_TYPE, BagError, Recording, read
+from piezo_control.recording.writer import LITTLE_ENDIAN, SAMPLE_CDR, BagWriter, write_recording
 
 H = 1e-4
 COUNT = 20_000  # more than one chunk of the MCAP file

@@ -12,8 +12,8 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import settling_time, step_metrics
 from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
-from piezo_sim.cantilever import CantileverParameters
 from piezo_sim.engine import run
+from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"

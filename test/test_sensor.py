@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from piezo_sim.sensor import Sensor, read
+from piezo_sim.plant.sensor import Sensor, read
 
 
 def readings(deflections, resolution=0.0, noise=0.0, dropout_rate=0.0, delay=0, seed=1):

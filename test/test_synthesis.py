@@ -12,19 +12,17 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piezo_control import synthesis
-from piezo_control.certificate import certify
-from piezo_control.design_problem import (
+from piezo_control.design import synthesis
+from piezo_control.design.certificate import certify
+from piezo_control.design.linear_loop import controller_response
+from piezo_control.design.problem import (
     DesignProblem,
     FingerModel,
     Prefilter,
     TransferFunction,
     Weights,
 )
-from piezo_control.feedback import FeedbackParameters
-from piezo_control.linear_loop import controller_response
-from piezo_control.parameters import ParameterError, build, load
-from piezo_control.synthesis import (
+from piezo_control.design.synthesis import (
     StateSpace,
     SynthesisError,
     balanced,
@@ -39,6 +37,8 @@ from piezo_control.synthesis import (
     synthesize,
     to_w_plane,
 )
+from piezo_control.feedback import FeedbackParameters
+from piezo_control.parameters import ParameterError, build, load
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"
 CONSTANT = TransferFunction((1.0,), (1.0,))

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from piezo_sim.thermal import retention, warm
+from piezo_sim.plant.thermal import retention, warm
 
 
 @pytest.mark.parametrize("samples", [1, 7, 3000])

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from piezo_control import metrics
-from piezo_control.recording import BagError, Recording
+from piezo_control.recording.recording import BagError, Recording
 
 Figures = dict[str, float | int | None]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from piezo_control.recording import BagError, Recording, read
+from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import Figures, analyse, classify
 from piezo_sim.experiment.report import Section

@@ -12,14 +12,14 @@ import numpy as np
 import yaml
 from ament_index_python.packages import get_package_share_directory
 
-from piezo_control.excitation import decaying_sine
-from piezo_control.feedback_node import FeedbackNodeParameters
-from piezo_control.feedforward_node import FeedforwardNodeParameters
+from piezo_control.identification.excitation import decaying_sine
+from piezo_control.nodes.feedback import FeedbackNodeParameters
+from piezo_control.nodes.feedforward import FeedforwardNodeParameters
+from piezo_control.nodes.recorder import RecorderParameters
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
-from piezo_sim.cantilever_node import CantileverNodeParameters
-from piezo_sim.recorder_node import RecorderParameters
-from piezo_sim.temperature_node import TemperatureNodeParameters
+from piezo_sim.nodes.cantilever import CantileverNodeParameters
+from piezo_sim.nodes.temperature import TemperatureNodeParameters
 
 NODES = {
     "feedforward": FeedforwardNodeParameters,
@@ -246,7 +246,7 @@ def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
 
     * `step`: to `amplitude_<unit>` at `start` (default 0);
     * `sine`: `amplitude_<unit>`, `frequency_hz`, `periods`;
-    * `decaying_sine`: `amplitude_<unit>`, `frequency_hz`, `cycles` (piezo_control.excitation);
+    * `decaying_sine`: `amplitude_<unit>`, `frequency_hz`, `cycles` (piezo_control.identification.excitation);
     * `points`: `time` and `value_<unit>`, joined by straight lines;
     * `multisine`: two periods of `period`, of about `lines` cosines with frequencies from 1 / `period` to
       `highest_rad_s`, evenly spaced on a logarithmic axis and multiples of the lowest one; equally

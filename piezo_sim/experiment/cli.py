@@ -16,14 +16,14 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from piezo_control.parameters import ParameterError
-from piezo_control.recording import BagError
+from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.analysis import ANALYSES
 from piezo_sim.experiment.cases import Case, read_experiment
-from piezo_sim.experiment.conductor import RunFailed
-from piezo_sim.experiment.engine_runner import run_on_engine
-from piezo_sim.experiment.processes import NodeDied
+from piezo_sim.experiment.on_engine import run_on_engine
+from piezo_sim.experiment.on_nodes.conductor import RunFailed
+from piezo_sim.experiment.on_nodes.processes import NodeDied
+from piezo_sim.experiment.on_nodes.runner import Interrupted, Run, run_cases
 from piezo_sim.experiment.report import Section, print_table, write_html
-from piezo_sim.experiment.runner import Interrupted, Run, run_cases
 
 EXPERIMENTS = {
     "step": "step of the reference and of the temperature (Fig. 13): `make demo`",

@@ -20,7 +20,7 @@ from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
 from piezo_control.metrics import last_cycle  # noqa: E402
-from piezo_control.recording import Recording  # noqa: E402
+from piezo_control.recording.recording import Recording  # noqa: E402
 from piezo_sim.experiment.analysis import frequency_response  # noqa: E402
 
 Lines = Mapping[str, Sequence[Recording]]

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from piezo_control.recording import BagError, Recording, read
+from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import QUANTITIES, Figures, analyse
+from piezo_sim.experiment.on_nodes.runner import Run
 from piezo_sim.experiment.report import Section, cell
-from piezo_sim.experiment.runner import Run
 
 MODE_TITLES = {
     "open_loop": "open loop (static gain)",

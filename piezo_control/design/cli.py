@@ -1,0 +1,194 @@
+"""From a design problem in YAML to a certified controller for `feedback`.
+
+The problem is a ROS parameter file for the node name `synthesize`: finger, uncertainty,
+specifications, and either weights or nothing, in which case they are found from the specifications.
+The controller is written only when the recomputed closed loop meets every specification (or with
+--force, and then says that it is not certified). Next to it, into --report: certificate.json, the
+complete problem with everything that was found, and pictures.
+
+Exit code: 0 certified, 1 not certified, 2 unusable input or a problem without a solution.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+# Many small matrices: the threads of BLAS, started with numpy, would make the search ten times slower.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+from piezo_control.design import plots as design_plots  # noqa: E402
+from piezo_control.design.certificate import Certificate, Row, certify  # noqa: E402
+from piezo_control.design.problem import DesignProblem  # noqa: E402
+from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
+from piezo_control.feedback import FeedbackParameters  # noqa: E402
+from piezo_control.parameters import ParameterError, build, dump, load  # noqa: E402
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    arguments = parse()
+    console = Console()
+    begin = time.perf_counter()
+    try:
+        problem = read_problem(arguments.problem, arguments.cantilever)
+        design = synthesize(problem)
+    except (ParameterError, SynthesisError) as error:
+        print(f"synthesize: {arguments.problem}: {error}", file=sys.stderr)
+        return 2
+    certificate = certify(design.problem, design.controller, design.gamma)
+    show(console, certificate)
+    report = arguments.report or Path("out", "synthesize", problem.name)
+    written = write_report(report, design.problem, design.controller, certificate)
+    out = arguments.out or Path(f"feedback_{problem.name}.yaml")
+    if certificate.met or arguments.force:
+        controller = dataclasses.replace(design.controller, certified=certificate.met)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        dump(out, "feedback", controller, comment(certificate, arguments.problem))
+        written.append(out)
+    for path in written:
+        console.print(f"wrote {path}", soft_wrap=True)
+    console.print(f"took {time.perf_counter() - begin:.1f} s")
+    if not certificate.met:
+        failed = ", ".join(row.specification for row in certificate.rows if not row.met)
+        hint = "" if arguments.force else f"; {out} is only written with --force"
+        print(f"synthesize: NOT certified: {failed}{hint}", file=sys.stderr)
+    return 0 if certificate.met else 1
+
+
+def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
+    """Read a design problem; D(s), sample time and sensor delay from `cantilever` when given.
+
+    Raises ParameterError naming file and value.
+    """
+    values = load(path, "synthesize")
+    if cantilever is not None:
+        identified = load(cantilever, "cantilever")
+        names = {
+            "dynamics.denominator": "finger.denominator",
+            "sample_time": "finger.sample_time",
+            "sensor.delay_samples": "finger.delay_samples",
+            "thermal.time_constant": "finger.drift_time_constant",
+        }
+        values.update(
+            {ours: identified[theirs] for theirs, ours in names.items() if theirs in identified}
+        )
+    return build(DesignProblem, values, str(path))
+
+
+def write_report(
+    folder: Path,
+    problem: DesignProblem,
+    controller: FeedbackParameters,
+    certificate: Certificate,
+) -> list[Path]:
+    """Write certificate, complete problem and pictures; return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    as_json = folder / "certificate.json"
+    as_json.write_text(json.dumps(_finite(certificate.as_dict()), indent=2) + "\n")
+    solved = folder / "problem.yaml"
+    dump(solved, "synthesize", problem, f"Design problem of '{problem.name}', nothing left open.")
+    return [as_json, solved, *design_plots.draw(problem, controller, certificate, folder)]
+
+
+def _finite(value: Any) -> Any:
+    """Return plain data without NaN and infinities, which JSON does not know: they become null."""
+    if isinstance(value, dict):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+HEADINGS = ("specification", "required", "nominal", "worst case", "met", "worst at")
+
+
+def cells(row: Row) -> tuple[str, ...]:
+    """Return a line of the certificate as text, one entry per heading."""
+    label = f"{row.specification}, {row.unit}" if row.unit else row.specification
+    values = (f"{value:.4g}" for value in (row.required, row.nominal, row.worst))
+    return (label, *values, "yes" if row.met else "NO", row.at)
+
+
+def show(console: Console, certificate: Certificate) -> None:
+    """Print the certificate as a table, and the figures that nothing is required of."""
+    verdict = "certified" if certificate.met else "NOT certified"
+    table = Table(title=f"{certificate.name}: {verdict}")
+    for heading in HEADINGS[:-1]:
+        table.add_column(heading)
+    for row in certificate.rows:
+        table.add_row(*cells(row)[:-1], style="" if row.met else "red")
+    console.print(table)
+    console.print(summary(certificate))
+
+
+def summary(certificate: Certificate) -> str:
+    """Return margins, bandwidth and stable range in words."""
+    n, w, o = certificate.nominal, certificate.worst, certificate.outer
+    return (
+        f"margins, nominal (worst): gain {n['gain_up']:.3g} ({w['gain_up']:.3g}), phase "
+        f"{n['phase_deg']:.0f} ({w['phase_deg']:.0f}) deg, delay {1e3 * n['delay_s']:.2g} "
+        f"({1e3 * w['delay_s']:.2g}) ms\n"
+        f"-3 dB at {n['bandwidth']:.4g} rad/s, static sensitivity {n['sensitivity_static']:.2g}\n"
+        f"peaks, nominal (worst): |T| {n['complementary_peak']:.3g} ({w['complementary_peak']:.3g}), "
+        f"|G S| {n['disturbance_peak']:.3g} ({w['disturbance_peak']:.3g})\n"
+        f"nominally stable for resonances from {100 * (n['resonance_low'] - 1):+.1f} to "
+        f"{100 * (n['resonance_high'] - 1):+.1f} % (searched -60 to +60 %)\n"
+        f"in the wider box: 5 % settling {1e3 * o['settling']:.3g} ms, overshoot "
+        f"{100 * o['overshoot']:.2g} %, Ms {o['sensitivity_peak']:.3g}"
+    )
+
+
+def comment(certificate: Certificate, source: Path) -> str:
+    """Return the head of the controller's file: verdict and table."""
+    verdict = "Certified: every specification is met by the recomputed closed loop."
+    if not certificate.met:
+        verdict = "NOT CERTIFIED, written with --force: see the lines with NO."
+    lines = [HEADINGS, *(cells(row) for row in certificate.rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
+    table = (
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths)).rstrip() for line in lines
+    )
+    return "\n".join(
+        [
+            f"Controller '{certificate.name}', by `synthesize {source.name}`. {verdict}",
+            *table,
+            summary(certificate),
+        ]
+    )
+
+
+def parse() -> argparse.Namespace:
+    """Return the command line's arguments."""
+    parser = argparse.ArgumentParser(
+        prog="synthesize", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "problem", type=Path, help="design problem, e.g. params/synthesis_robust.yaml"
+    )
+    parser.add_argument(
+        "--out", type=Path, help="controller to write (feedback_<name>.yaml in this folder)"
+    )
+    parser.add_argument(
+        "--report", type=Path, help="folder of certificate and pictures (out/synthesize/<name>)"
+    )
+    parser.add_argument(
+        "--cantilever",
+        type=Path,
+        help="parameter file of the cantilever, as `identify` writes it: its D(s), sample time, delay "
+        "and thermal lag instead of the problem's",
+    )
+    parser.add_argument(
+        "--force", action="store_true", help="write the controller though it is not certified"
+    )
+    return parser.parse_args()

@@ -1,0 +1,391 @@
+"""From recordings of a finger to the parameters its nodes load.
+
+Reads rosbag2 folders and text files, and writes into one folder (--out), step by step:
+feedforward.yaml (`hysteresis`), cantilever.yaml (`hysteresis`, `dynamics`, `stiffness`, `drift`), a
+picture and the fit's figures (JSON) of each step. `check` judges identified parameters on another
+recording.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.hysteresis import HysteresisParameters, deflection_history
+from piezo_control.identification.drift import identify_drift
+from piezo_control.identification.dynamics import identify_dynamics
+from piezo_control.identification.hysteresis import (
+    FitQuality,
+    HysteresisModel,
+    equal_thresholds,
+    identify_hysteresis,
+    quality,
+    settled,
+)
+from piezo_control.identification import plots as plots
+from piezo_control.identification.measurement import (
+    QUANTITIES,
+    Measurement,
+    MeasurementError,
+    is_bag,
+    read_measurement,
+)
+from piezo_control.parameters import ParameterError, build, dump, load
+from piezo_sim.plant.cantilever import CantileverParameters
+
+
+def main() -> int:
+    """Run the command line and return its exit code: 0 done, 2 unusable input."""
+    arguments = parse()
+    console = Console()
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        for written in arguments.run(arguments, console):
+            console.print(f"wrote {written}", soft_wrap=True)
+    except (MeasurementError, ParameterError, OSError) as error:
+        print(f"identify: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
+    """Identify the hysteresis operator; write feedforward.yaml and cantilever.yaml."""
+    measurement = read(arguments.recording, arguments)
+    measurement.need_varying("voltage", "deflection")
+    first = settled(measurement) if arguments.skip is None else arguments.skip
+    last = len(measurement.time)
+    thresholds = arguments.thresholds or equal_thresholds(measurement, arguments.plays)
+    dead_zones = arguments.dead_zones if arguments.model == "modified" else 0
+    lag = arguments.lag
+    if lag is None:
+        # The delay of a bag's deflections is known. A voltage held before its deflection counts there as
+        # if reached at the end, but the finger smooths the steps: it is half a sample ahead of that.
+        lag = -0.5 * measurement.sample_time if is_bag(arguments.recording) else "identify"
+
+    def fit(end: int) -> HysteresisModel:
+        return identify_hysteresis(
+            measurement, thresholds, dead_zones, None if lag == "identify" else lag, first, end
+        )
+
+    def judge(model: HysteresisModel, samples: slice) -> FitQuality:
+        modelled = model.deflection(measurement.time, measurement.voltage)
+        return quality(measurement.deflection[samples], modelled[samples])
+
+    split = last - int(arguments.hold_back * (last - first))
+    fits = {}
+    if split < last:
+        before = fit(split)
+        fits[f"first {split - first} samples, fitted"] = judge(before, slice(first, split))
+        fits[f"last {last - split} samples, held back"] = judge(before, slice(split, last))
+    model = fit(last)
+    fits[f"all {last - first} samples, fitted"] = judge(model, slice(first, last))
+    show(console, f"{arguments.model} hysteresis of {arguments.recording}", fits)
+    console.print(
+        f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
+        f"smoothness {model.smoothness:g}"
+    )
+
+    feedforward = FeedforwardParameters(
+        static_gain=float(np.ptp(measurement.deflection[first:]) / np.ptp(measurement.voltage)),
+        voltage_limit=float(np.abs(measurement.voltage).max()),
+        hysteresis=model.parameters,
+    )
+    whole = fits[f"all {last - first} samples, fitted"]
+    comment = (
+        f"{arguments.model} hysteresis identified from {arguments.recording}: rms "
+        f"{whole.rms_percent:.3f} %, max {whole.maximum_percent:.2f} % of {whole.stroke * 1e6:.2f} um.\n"
+        "The deflection shows lag seconds late and with the offset of the sensor; both are no part of the\n"
+        "operator, and the feedforward does not use them. voltage_limit is the largest voltage recorded."
+    )
+    path = arguments.out / "feedforward.yaml"
+    dump(path, "feedforward", feedforward, comment)
+    with path.open("a") as file:
+        yaml.safe_dump(
+            {"/**/identification": {"ros__parameters": {"lag": model.lag, "offset": model.offset}}},
+            file,
+        )
+    picture = arguments.out / "hysteresis.png"
+    modelled = model.deflection(measurement.time, measurement.voltage)
+    plots.loops(measurement, modelled, slice(first, last), picture)
+    return [
+        path,
+        update_cantilever(arguments.out, comment.splitlines()[0], hysteresis=model.parameters),
+        picture,
+        write_json(arguments.out / "hysteresis.json", {n: figures(f) for n, f in fits.items()}),
+    ]
+
+
+def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
+    """Judge feedforward.yaml of --out on a recording it was not identified from."""
+    measurement = read(arguments.recording, arguments)
+    path = arguments.out / "feedforward.yaml"
+    values = load(path, "identification")
+    model = HysteresisModel(stored_hysteresis(path), values["offset"], values["lag"], 0.0)
+    samples = slice(arguments.skip or 0, None)
+    modelled = model.deflection(measurement.time, measurement.voltage)
+    modelled += np.mean((measurement.deflection - modelled)[samples])
+    fit = quality(measurement.deflection[samples], modelled[samples])
+    show(console, f"{path} on {arguments.recording}", {"offset of its own": fit})
+    picture = arguments.out / "check.png"
+    plots.loops(measurement, modelled, samples, picture)
+    return [picture, write_json(arguments.out / "check.json", figures(fit))]
+
+
+def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
+    """Identify D(s) from a step or a sweep of the voltage; update cantilever.yaml."""
+    measurement = window(read(arguments.recording, arguments), arguments)
+    measurement.need_varying("voltage")
+    stored = arguments.out / "feedforward.yaml"
+    drive = measurement.voltage
+    if stored.exists():
+        drive = deflection_history(stored_hysteresis(stored), drive)
+    return finish_dynamics("dynamics", measurement, drive, arguments, console)
+
+
+def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
+    """Identify the elastic constant from a step of the tip force; update cantilever.yaml."""
+    measurement = window(read(arguments.recording, arguments), arguments)
+    measurement.need_varying("tip_force")
+    if np.ptp(measurement.voltage) > 0.0:
+        k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
+        raise measurement.error("voltage", k, "must be constant while the tip force changes")
+    return finish_dynamics("stiffness", measurement, measurement.tip_force, arguments, console)
+
+
+def finish_dynamics(
+    name: str,
+    measurement: Measurement,
+    drive: np.ndarray,
+    arguments: argparse.Namespace,
+    console: Console,
+) -> list[Path]:
+    """Fit, show and store the response to `drive`."""
+    model = identify_dynamics(measurement, drive)
+    modelled = model.deflection(measurement.time, drive)
+    fit = quality(measurement.deflection, modelled)
+    show(console, f"{name} of {arguments.recording}", {"all samples, fitted": fit})
+    found = {
+        "natural_frequency_hz": model.natural_frequency / (2.0 * np.pi),
+        "damping_ratio": model.damping_ratio,
+        "denominator": model.denominator,
+    }
+    change = {"denominator": model.denominator}
+    if name == "stiffness":
+        found["elastic_constant"] = model.gain
+        change = {"elastic_constant": model.gain}
+    for key, value in found.items():
+        console.print(f"{key}: {value}")
+    picture = arguments.out / f"{name}.png"
+    curve = np.column_stack((measurement.time, measurement.deflection, modelled))
+    plots.responses([(measurement.source, curve)], picture)
+    base = stored_cantilever(arguments.out)
+    comment = (
+        f"{name} identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke."
+    )
+    return [
+        update_cantilever(arguments.out, comment, dynamics=replace(base.dynamics, **change)),
+        picture,
+        write_json(arguments.out / f"{name}.json", {**found, **figures(fit)}),
+    ]
+
+
+def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
+    """Identify creep and thermal deflection from long recordings; update cantilever.yaml."""
+    stored = arguments.out / "feedforward.yaml"
+    base = stored_cantilever(arguments.out)
+    operator = stored_hysteresis(stored) if stored.exists() else base.hysteresis
+    model = identify_drift([read(path, arguments) for path in arguments.recording], operator)
+    fits = {
+        str(path): quality(curve[:, 1], curve[:, 2])
+        for path, curve in zip(arguments.recording, model.fitted)
+    }
+    show(console, "creep and thermal deflection", fits)
+    found = {name: value for name, value in asdict(model).items() if name != "fitted"}
+    for key, value in found.items():
+        console.print(f"{key}: {value}")
+    picture = arguments.out / "drift.png"
+    plots.responses(list(zip(map(str, arguments.recording), model.fitted)), picture)
+    creep, thermal = base.creep, base.thermal
+    if model.creep_gain + model.creep_gain_per_degc > 0.0:
+        creep = replace(
+            creep,
+            gain=model.creep_gain,
+            gain_per_degc=model.creep_gain_per_degc,
+            times=model.creep_times,
+            shares=model.creep_shares,
+        )
+    if model.time_constant > 0.0:
+        thermal = replace(thermal, sensitivity=model.sensitivity, time_constant=model.time_constant)
+    names = ", ".join(map(str, arguments.recording))
+    comment = f"Creep and thermal deflection identified from {names}."
+    return [
+        update_cantilever(arguments.out, comment, creep=creep, thermal=thermal),
+        picture,
+        write_json(
+            arguments.out / "drift.json",
+            {**found, "fits": {name: figures(fit) for name, fit in fits.items()}},
+        ),
+    ]
+
+
+def read(path: Path, arguments: argparse.Namespace) -> Measurement:
+    """Read one recording with the columns and units of the command line."""
+    columns = {q: getattr(arguments, q) for q in QUANTITIES if getattr(arguments, q)}
+    rate = arguments.sample_rate
+    return read_measurement(
+        path,
+        columns,
+        1.0 / rate if rate else None,
+        arguments.finger,
+        arguments.run_number,
+        arguments.sensor_delay,
+    )
+
+
+def window(measurement: Measurement, arguments: argparse.Namespace) -> Measurement:
+    """Return the part of a measurement between --start and --end."""
+    time = measurement.time - measurement.time[0]
+    begin, end = np.searchsorted(time, (arguments.start, arguments.end))
+    return measurement.part(slice(int(begin), int(end)))
+
+
+def stored_hysteresis(path: Path) -> HysteresisParameters:
+    """Return the operator in a parameter file of the feedforward node."""
+    return build(FeedforwardParameters, load(path, "feedforward"), str(path)).hysteresis
+
+
+def stored_cantilever(out: Path) -> CantileverParameters:
+    """Return what cantilever.yaml of the folder says, the defaults without it."""
+    path = out / "cantilever.yaml"
+    if not path.exists():
+        return CantileverParameters()
+    return build(CantileverParameters, load(path, "cantilever"), str(path))
+
+
+def update_cantilever(out: Path, comment: str, **groups: object) -> Path:
+    """Replace groups of cantilever.yaml, keeping the rest and the comments of earlier steps."""
+    path = out / "cantilever.yaml"
+    earlier = path.read_text().splitlines() if path.exists() else []
+    comments = [line[2:] for line in earlier if line.startswith("# ")]
+    parameters = replace(stored_cantilever(out), **groups)
+    dump(path, "cantilever", parameters, "\n".join([*comments, comment]))
+    return path
+
+
+def show(console: Console, title: str, fits: dict[str, FitQuality]) -> None:
+    """Print the figures of fits as a table."""
+    table = Table(title=title)
+    for heading in ("", "rms µm", "max µm", "stroke µm", "rms %", "max %"):
+        table.add_column(heading, justify="right" if heading else "left")
+    for name, fit in fits.items():
+        lengths = (f"{value * 1e6:.4g}" for value in (fit.rms, fit.maximum, fit.stroke))
+        table.add_row(name, *lengths, f"{fit.rms_percent:.3f}", f"{fit.maximum_percent:.2f}")
+    console.print(table)
+
+
+def figures(fit: FitQuality) -> dict[str, float]:
+    """Return the figures of a fit for JSON: m and % of the stroke."""
+    return {
+        **asdict(fit),
+        "rms_percent": fit.rms_percent,
+        "maximum_percent": fit.maximum_percent,
+    }
+
+
+def write_json(path: Path, content: dict) -> Path:
+    """Write `content` and return the path."""
+    path.write_text(json.dumps(content, indent=2) + "\n")
+    return path
+
+
+def parse() -> argparse.Namespace:
+    """Return the command line's arguments."""
+    reading = argparse.ArgumentParser(add_help=False)
+    text = reading.add_argument_group("text files", "COLUMN is a name or a number from 0")
+    for quantity, units in QUANTITIES.items():
+        text.add_argument(
+            f"--{quantity.replace('_', '-')}", metavar="COLUMN[:UNIT]",
+            help=f"column of the {quantity.replace('_', ' ')}; units {', '.join(units)}",
+        )  # fmt: skip
+    text.add_argument(
+        "--sample-rate", type=float, metavar="HZ", help="where no column has the time"
+    )
+    bag = reading.add_argument_group("bags")
+    bag.add_argument("--finger", default="", metavar="NAMESPACE", help="which of several fingers")
+    bag.add_argument(
+        "--run", dest="run_number", type=int, metavar="N", help="which of several runs"
+    )
+    bag.add_argument(
+        "--sensor-delay", type=int, default=1, metavar="SAMPLES", help="age of a deflection (1)"
+    )
+    reading.add_argument(
+        "--out", "-o", type=Path, default=Path("out/identified"), help="folder (out/identified)"
+    )
+    part = argparse.ArgumentParser(add_help=False)
+    part.add_argument("--start", type=float, default=0.0, metavar="S", help="use from here on")
+    part.add_argument("--end", type=float, default=np.inf, metavar="S", help="use up to here")
+
+    parser = argparse.ArgumentParser(
+        prog="identify", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(required=True, metavar="WHAT")
+
+    def command(function, several: bool = False, parents=(reading,)) -> argparse.ArgumentParser:
+        added = commands.add_parser(
+            function.__name__, parents=parents, help=function.__doc__, description=function.__doc__
+        )
+        added.add_argument("recording", type=Path, nargs="+" if several else None)
+        added.set_defaults(run=function)
+        return added
+
+    fit = command(hysteresis)
+    fit.add_argument(
+        "--model", choices=("modified", "classical"), default="modified",
+        help="with dead zones for asymmetric actuators (default), or without",
+    )  # fmt: skip
+    fit.add_argument("--plays", type=int, default=20, metavar="N", help="equal thresholds (20)")
+    fit.add_argument("--thresholds", type=volts, metavar="V,V,...", help="thresholds instead")
+    fit.add_argument("--dead-zones", type=int, default=3, metavar="N", help="on either side (3)")
+    fit.add_argument(
+        "--lag", type=seconds, metavar="S",
+        help="lag of the deflection, or 'identify'; default: known of bags, 'identify' for text files",
+    )  # fmt: skip
+    fit.add_argument(
+        "--skip", type=int, metavar="SAMPLES",
+        help="not fitted; default: until the voltage has been to both ends",
+    )  # fmt: skip
+    fit.add_argument(
+        "--hold-back", type=share, default=0.3, metavar="SHARE", help="of the samples (0.3)"
+    )
+    command(check).add_argument("--skip", type=int, metavar="SAMPLES", help="not judged")
+    command(dynamics, parents=(reading, part))
+    command(stiffness, parents=(reading, part))
+    command(drift, several=True)
+    return parser.parse_args()
+
+
+def share(text: str) -> float:
+    """Return a number from 0 to 0.9."""
+    value = float(text)
+    if not 0.0 <= value <= 0.9:
+        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 0.9")
+    return value
+
+
+def seconds(text: str) -> float | str:
+    """Return a number of seconds, or the word 'identify'."""
+    return text if text == "identify" else float(text)
+
+
+def volts(text: str) -> tuple[float, ...]:
+    """Return the numbers of a list like '0,3,6'."""
+    return tuple(float(entry) for entry in text.split(","))

@@ -1,0 +1,109 @@
+"""Identification of D(s) = 1 / (a2 s^2 + a1 s + 1) and of the gain in front of it.
+
+The model's output is compared, not its equation, so noise does not bias the damping::
+
+    deflection = gain D(s) drive + offset + slope t
+
+`drive` is held from sample to sample (exact zero-order hold); natural frequency and damping ratio are
+searched, the rest is linear least squares. With the tip force as drive the gain is the elastic
+constant s_p, with the hysteresis operator's output it should be 1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter
+
+from piezo_control.identification.measurement import Measurement, MeasurementError
+
+FREQUENCIES = 150  # tried before the search, from one cycle in the measurement to Nyquist
+DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
+
+
+@dataclass(frozen=True)
+class DynamicsModel:
+    """Second-order dynamics behind a static gain."""
+
+    natural_frequency: float  # rad/s
+    damping_ratio: float
+    gain: float  # m per unit of the drive
+    offset: float  # m
+    slope: float  # m/s
+
+    @property
+    def denominator(self) -> tuple[float, float, float]:
+        """Coefficients a2, a1, 1 of D(s), highest power first."""
+        w = self.natural_frequency
+        return 1.0 / w**2, 2.0 * self.damping_ratio / w, 1.0
+
+    def deflection(self, time: ArrayLike, drive: ArrayLike) -> NDArray[np.float64]:
+        """Return the deflection (m) at evenly spaced `time` (s) from rest at drive[0]."""
+        time = np.asarray(time, float)
+        response = _respond(
+            self.natural_frequency, self.damping_ratio, np.asarray(drive, float), time[1] - time[0]
+        )
+        return self.gain * response + self.offset + self.slope * (time - time[0])
+
+
+def _respond(frequency: float, damping: float, drive: NDArray, sample_time: float) -> NDArray:
+    """Return D(s) drive at the ends of the intervals over which the drive is held, from rest."""
+    continuous = ([1.0], [1.0 / frequency**2, 2.0 * damping / frequency, 1.0])
+    numerator, denominator, _ = cont2discrete(continuous, sample_time, method="zoh")
+    # The drive of sample k is held before sample k: the delay that zoh puts in is not there.
+    change = drive - drive[0]
+    return drive[0] + lfilter(numerator.ravel()[1:], denominator, change)
+
+
+def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsModel:
+    """Identify natural frequency, damping ratio and gain from a step or a sweep of `drive`.
+
+    Parameters
+    ----------
+    measurement : evenly sampled, well above twice the natural frequency
+    drive : 1-D array as long as the measurement: tip force (N), static deflection (m), voltage (V)
+
+    Raises
+    ------
+    MeasurementError
+        If the deflection is constant, the sampling uneven, or no vibration is found below the
+        Nyquist frequency.
+    """
+    measurement.need_varying("deflection")
+    measurement.need_even_sampling()
+    drive = np.asarray(drive, float)
+    if np.ptp(drive) == 0.0:
+        raise MeasurementError(f"{measurement.source}: the drive is constant")
+    sample_time = measurement.sample_time
+    time = measurement.time - measurement.time[0]
+    columns = np.column_stack((np.ones_like(time), time))
+
+    def linear(frequency: float, damping: float) -> tuple[NDArray, NDArray]:
+        response = _respond(frequency, damping, drive, sample_time)
+        regressors = np.column_stack((response, columns))
+        scale = np.linalg.norm(regressors, axis=0)
+        x = np.linalg.lstsq(regressors / scale, measurement.deflection, rcond=None)[0] / scale
+        return x, measurement.deflection - regressors @ x
+
+    nyquist = math.pi / sample_time
+    start = min(
+        ((w, d) for w in np.geomspace(2.0 * math.pi / time[-1], 0.98 * nyquist, FREQUENCIES)
+         for d in DAMPING_RATIOS),
+        key=lambda guess: float(np.sum(linear(*guess)[1] ** 2)),
+    )  # fmt: skip
+    spread = float(np.std(measurement.deflection))
+    found = least_squares(
+        lambda logs: linear(*np.exp(logs))[1] / spread, np.log(start), x_scale=(1e-3, 1e-1)
+    )
+    frequency, damping = np.exp(found.x).tolist()
+    if frequency >= nyquist:
+        raise MeasurementError(
+            f"{measurement.source}: no vibration below the Nyquist frequency of "
+            f"{0.5 / sample_time:g} Hz; sample faster"
+        )
+    gain, offset, slope = linear(frequency, damping)[0].tolist()
+    return DynamicsModel(frequency, damping, gain, offset, slope)

@@ -1,0 +1,265 @@
+"""Measurements to identify from, out of a rosbag2 folder or a text file, checked before use.
+
+Sample k pairs a deflection with the voltage that was held during the sample time *before* the instant
+the sensor saw it; temperature and tip force likewise. A text file is expected to be paired so. In a
+bag the cantilever publishes deflection k, taken `sensor_delay` samples earlier, and only then receives
+voltage k, so deflection k belongs to voltage k - 1 - sensor_delay, and to 0 V before the first one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from piezo_control.recording import recording
+
+SHORTEST = 50  # samples
+QUANTITIES = {  # the units a column may have, with what makes SI (degC for temperature) of them
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
+    "voltage": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
+    "deflection": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "temperature": {"degc": 1.0},
+    "tip_force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6},
+}
+
+
+class MeasurementError(ValueError):
+    """A measurement that cannot be used; the message names file, column and row."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Signals of one finger over time, equally long 1-D arrays; None where not recorded.
+
+    `rows` holds what names a sample in messages: line numbers of a file, sample numbers of a bag.
+    """
+
+    source: str
+    time: NDArray[np.float64]  # s
+    voltage: NDArray[np.float64]  # V
+    deflection: NDArray[np.float64]  # m
+    temperature: NDArray[np.float64] | None  # degC
+    tip_force: NDArray[np.float64] | None  # N
+    rows: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        if len(self.time) < SHORTEST:
+            raise MeasurementError(
+                f"{self.source}: {len(self.time)} samples, must be at least {SHORTEST}"
+            )
+        for name in QUANTITIES:
+            column = getattr(self, name)
+            bad = [] if column is None else np.flatnonzero(~np.isfinite(column))
+            if len(bad):
+                raise self.error(name, bad[0], "must be a finite number")
+        late = np.flatnonzero(np.diff(self.time) <= 0.0)
+        if len(late):
+            raise self.error("time", late[0] + 1, f"not after {self.time[late[0]]:g} before it")
+
+    def error(self, column: str, sample: int, text: str) -> MeasurementError:
+        """Return the error about one entry, to be raised."""
+        value = getattr(self, column)[sample]
+        return MeasurementError(
+            f"{self.source}: column '{column}', row {self.rows[sample]} is {value:g}: {text}"
+        )
+
+    def need_varying(self, *columns: str) -> None:
+        """Raise MeasurementError for the first of the `columns` that is missing or constant."""
+        for name in columns:
+            values = getattr(self, name)
+            if values is None:
+                raise MeasurementError(f"{self.source}: no column '{name}', which is needed")
+            if np.ptp(values) == 0.0:
+                raise MeasurementError(
+                    f"{self.source}: column '{name}' is {values[0]:g} in all rows "
+                    f"{self.rows[0]} to {self.rows[-1]}: nothing to identify from"
+                )
+
+    @property
+    def sample_time(self) -> float:
+        """Time from sample to sample (s), the median."""
+        return float(np.median(np.diff(self.time)))
+
+    def need_even_sampling(self) -> None:
+        """Raise MeasurementError at the first gap: a step that differs from the sample time by 1 %."""
+        steps = np.diff(self.time)
+        uneven = np.flatnonzero(np.abs(steps - self.sample_time) > 0.01 * self.sample_time)
+        if len(uneven):
+            i = uneven[0]
+            raise self.error(
+                "time", i + 1, f"{steps[i]:g} s after the row before, must be {self.sample_time:g}"
+            )
+
+    def part(self, samples: slice) -> Measurement:
+        """Return the measurement of these samples only."""
+        cut = {
+            name: None if getattr(self, name) is None else getattr(self, name)[samples]
+            for name in (*QUANTITIES, "rows")
+        }
+        return replace(self, **cut)
+
+
+def read_measurement(
+    path: str | Path,
+    columns: Mapping[str, str] | None = None,
+    sample_time: float | None = None,
+    finger: str = "",
+    run: int | None = None,
+    sensor_delay: int = 1,
+) -> Measurement:
+    """Read a bag (`finger`, `run`, `sensor_delay`) or a text file (`columns`, `sample_time`).
+
+    Raises MeasurementError, naming file, column and row, when it cannot be used.
+    """
+    if is_bag(path):
+        return read_bag(path, finger, run, sensor_delay)
+    return read_text(path, columns or {}, sample_time)
+
+
+def is_bag(path: str | Path) -> bool:
+    """Tell a rosbag2 folder or storage file from a text file."""
+    return Path(path).is_dir() or Path(path).suffix in (".mcap", ".db3")
+
+
+def read_text(
+    path: str | Path, columns: Mapping[str, str], sample_time: float | None = None
+) -> Measurement:
+    """Read a text file of numbers separated by commas, semicolons or white space.
+
+    Parameters
+    ----------
+    path : path of the file; lines that begin with '#' are ignored
+    columns : mapping
+        Where to find a quantity: ``{"deflection": "4:um"}`` is column 4, counted from 0, in
+        micrometres; with a line of names, ``"probe:um"`` is the column of that name. A quantity not
+        mentioned is looked for under its own name, also with a unit behind it: ``deflection_um``.
+    sample_time : float, optional
+        Time between rows (s) of a file without time column.
+    """
+    try:
+        lines = Path(path).read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise MeasurementError(f"{path}: cannot be read as text: {error}") from None
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
+    if not numbered:
+        raise MeasurementError(f"{path}: no rows")
+    first = numbered[0][1]
+    separator = next((c for c in ",;" if c in first), None)
+    names = [entry.strip() for entry in first.split(separator)]
+    has_names = not all(_is_number(name) for name in names)
+    if has_names:
+        numbered = numbered[1:]
+    else:
+        names = [str(index) for index in range(len(names))]
+    found = {q: _find(path, q, columns.get(q), names, has_names) for q in QUANTITIES}
+    for quantity in ("voltage", "deflection"):
+        if found[quantity] is None:
+            raise MeasurementError(
+                f"{path}: no column for '{quantity}'; the file has {', '.join(names)}"
+            )
+    if found["time"] is None and sample_time is None:
+        raise MeasurementError(f"{path}: no column for 'time' and no sample time given")
+    rows = np.array([n for n, _ in numbered])
+    values = {
+        quantity: None if place is None else place[1] * _column(path, numbered, separator, place[0])
+        for quantity, place in found.items()
+    }
+    if values["time"] is None:
+        values["time"] = sample_time * np.arange(len(rows))
+    return Measurement(str(path), rows=rows, **values)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _find(
+    path: str | Path, quantity: str, wanted: str | None, names: list[str], has_names: bool
+) -> tuple[int, float] | None:
+    """Return index and scale of the column of a quantity, None when there is none."""
+    units = QUANTITIES[quantity]
+    if wanted is None:
+        for unit, scale in units.items():
+            if f"{quantity}_{unit}" in names:
+                return names.index(f"{quantity}_{unit}"), scale
+        return (names.index(quantity), 1.0) if quantity in names else None
+    name, _, unit = wanted.partition(":")
+    unit = unit or next(iter(units))
+    if unit not in units:
+        raise MeasurementError(
+            f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
+        )
+    if name not in names:
+        kind = "has" if has_names else "has no line of names; its columns are"
+        raise MeasurementError(
+            f"{path}: no column '{name}' for '{quantity}'; the file {kind} {', '.join(names)}"
+        )
+    return names.index(name), units[unit]
+
+
+def _column(
+    path: str | Path, numbered: list[tuple[int, str]], separator: str | None, index: int
+) -> NDArray[np.float64]:
+    values = np.empty(len(numbered))
+    for sample, (row, line) in enumerate(numbered):
+        entries = line.split(separator)
+        try:
+            values[sample] = float(entries[index])
+        except IndexError:
+            raise MeasurementError(
+                f"{path}: row {row} has {len(entries)} columns, needs column {index}"
+            ) from None
+        except ValueError:
+            raise MeasurementError(
+                f"{path}: column {index}, row {row} is '{entries[index]}', must be a number"
+            ) from None
+    return values
+
+
+def read_bag(
+    path: str | Path, finger: str = "", run: int | None = None, sensor_delay: int = 1
+) -> Measurement:
+    """Read one run of one finger from a rosbag2 folder.
+
+    Parameters
+    ----------
+    path : path of the folder, or of its storage file
+    finger : namespace of the finger, needed when the bag has several
+    run : which run, from 0, of a bag in which the sample numbers start again
+    sensor_delay : age of a deflection (samples) when the cantilever publishes it
+    """
+    try:
+        recorded = recording.read(path, finger, run)
+    except recording.BagError as error:
+        raise MeasurementError(str(error)) from None
+    before = 1 + sensor_delay
+
+    def earlier(values: NDArray, at_start: float) -> NDArray:
+        return np.concatenate((np.full(before, at_start), values))[: len(values)]
+
+    def since_sent(values: NDArray, until_then: float | None = None) -> NDArray | None:
+        sent = np.flatnonzero(~np.isnan(values))
+        if not len(sent):
+            return None
+        start = values[sent[0]] if until_then is None else until_then
+        return earlier(np.concatenate((np.full(sent[0], start), values[sent[0] :])), start)
+
+    measurement = Measurement(
+        str(path),
+        (recorded.number - recorded.number[0]) * recorded.sample_time,
+        earlier(recorded.voltage, 0.0),
+        recorded.deflection,
+        since_sent(recorded.temperature),
+        since_sent(recorded.tip_force, until_then=0.0),
+        recorded.number,
+    )
+    measurement.need_even_sampling()
+    return measurement

@@ -1,0 +1,198 @@
+"""What all nodes share: parameters from one dataclass, a lifecycle, a `run` that stops safely."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import rclpy
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
+
+from piezo_control.nodes import spin
+from piezo_control.parameters import ParameterError, build, declarations
+
+ROS_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+    tuple[float, ...]: Parameter.Type.DOUBLE_ARRAY,
+    tuple[str, ...]: Parameter.Type.STRING_ARRAY,
+}
+
+
+class FingerNode(LifecycleNode):
+    """A lifecycle node whose ROS parameters are the fields of the dataclass `PARAMETERS`.
+
+    A subclass names its dataclass, and overrides `start` (activation), `stop` (deactivation, shutdown
+    and signals alike) and, where a change while active makes sense, `apply`. `parameters` always holds
+    a complete valid set: a change that the dataclass refuses is refused as a whole.
+    """
+
+    NAME: ClassVar[str]
+    PARAMETERS: ClassVar[type]
+
+    def __init__(self) -> None:
+        super().__init__(self.NAME)
+        self.declare_parameter(
+            "autostart",
+            True,
+            ParameterDescriptor(description="configure and activate at start", read_only=True),
+        )
+        self._declarations = declarations(self.PARAMETERS)
+        for name, (kind, field) in self._declarations.items():
+            default = field.default
+            if default == ():  # an empty list shows no element type, so it is set after the type
+                declared = self.declare_parameter(
+                    name, ROS_TYPES[kind], describe(name, kind, field)
+                )
+                if declared.type_ == Parameter.Type.NOT_SET:
+                    self.set_parameters([Parameter(name, ROS_TYPES[kind], [])])
+            else:
+                value = list(default) if isinstance(default, tuple) else default
+                self.declare_parameter(name, value, describe(name, kind, field))
+        self.parameters = build(self.PARAMETERS, self._values({}), self.NAME)
+        self.active = False
+        self.add_on_set_parameters_callback(self._validate)
+        self.add_post_set_parameters_callback(self._changed)
+
+    def start(self) -> None:
+        """Begin to work with `self.parameters`; a ValueError raised here refuses the activation."""
+
+    def stop(self) -> None:
+        """Leave the finger safe; called once when activity ends for whatever reason."""
+
+    def apply(self) -> None:
+        """Take up changed `self.parameters` while active."""
+
+    def refuses_while_active(self, names: set[str]) -> set[str]:
+        """Return those of `names` that cannot change while the node is active; by default all."""
+        return names
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            self.start()
+        except ValueError as error:
+            self.get_logger().error(f"not activated: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self.active = True
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._halt()
+        return super().on_deactivate(state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._halt()
+        return super().on_shutdown(state)
+
+    def _halt(self) -> None:
+        if self.active:
+            self.stop()
+            self.active = False
+
+    def _values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        values = {name: self.get_parameter(name).value for name in self._declarations}
+        values.update(changes)
+        return {
+            n: tuple(v) if not isinstance(v, (bool, int, float, str)) else v
+            for n, v in values.items()
+        }
+
+    def _validate(self, changes: list[Parameter]) -> SetParametersResult:
+        ours = {p.name: p.value for p in changes if p.name in self._declarations}
+        frozen = self.refuses_while_active(set(ours)) if self.active else set()
+        if frozen:
+            reason = f"{', '.join(sorted(frozen))}: deactivate '{self.NAME}' first"
+            return SetParametersResult(successful=False, reason=reason)
+        try:
+            build(self.PARAMETERS, self._values(ours))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _changed(self, changes: list[Parameter]) -> None:
+        if any(p.name in self._declarations for p in changes):
+            self.parameters = build(self.PARAMETERS, self._values({}), self.NAME)
+            if self.active:
+                self.apply()
+
+
+def describe(name: str, kind: type, field: Any) -> ParameterDescriptor:
+    """Return the ROS descriptor of a declared parameter: meaning, unit and allowed range."""
+    low, high = field.metadata["low"], field.metadata["high"]
+    text = field.metadata["description"]
+    if field.metadata["unit"]:
+        text += f" [{field.metadata['unit']}]"
+    if field.metadata["choices"]:
+        text += f"; one of {', '.join(field.metadata['choices'])}"
+    elif math.isfinite(low) or math.isfinite(high):
+        text += f"; in [{low:g}, {high:g}]"
+    descriptor = ParameterDescriptor(name=name, description=text)
+    if math.isfinite(low) and math.isfinite(high):
+        if kind is float:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif kind is int:
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(low), to_value=int(high), step=1)
+            ]
+    return descriptor
+
+
+def run(*node_types: type[FingerNode]) -> int:
+    """Run nodes in this process until SIGINT or SIGTERM; return its exit code.
+
+    Several nodes start in the order given and stop in the opposite one.
+    """
+    parse(node_types)
+    spin.init()
+    stop = spin.stop_event()
+    nodes: list[FingerNode] = []
+    try:
+        for node_type in node_types:
+            nodes.append(node_type())
+        for node in nodes:
+            if node.get_parameter("autostart").value:
+                node.trigger_configure()
+                node.trigger_activate()
+        spin.spin(nodes, stop.is_set)
+    except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
+        print(f"{node_types[len(nodes)].NAME}: {error}", file=sys.stderr)
+        return 2
+    finally:
+        for node in reversed(nodes):
+            node.trigger_shutdown()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def parse(node_types: Sequence[type[FingerNode]]) -> None:
+    """Serve `--help`: what the nodes do, and every parameter with default, unit and range."""
+    description, parameters = [], []
+    for node_type in node_types:
+        description.append(f"node '{node_type.NAME}': {sys.modules[node_type.__module__].__doc__}")
+        parameters.append(f"parameters of '{node_type.NAME}':")
+        for name, (kind, field) in declarations(node_type.PARAMETERS).items():
+            default = list(field.default) if isinstance(field.default, tuple) else field.default
+            parameters.append(f"  {name} = {default}")
+            parameters.append(f"      {describe(name, kind, field).description}")
+    parser = argparse.ArgumentParser(
+        description="\n".join(description),
+        epilog="\n".join(parameters),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        usage="%(prog)s [-h] [--ros-args -p NAME:=VALUE … --params-file FILE -r __ns:=/FINGER …]",
+    )
+    parser.parse_args(remove_ros_args(sys.argv)[1:])

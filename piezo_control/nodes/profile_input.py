@@ -1,0 +1,43 @@
+"""A signal that a node takes as single values or as a profile that travels ahead: the newest counts."""
+
+from __future__ import annotations
+
+from rclpy.node import Node
+
+from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.profile import Profile, SampledProfile
+from piezo_gripper_msgs.msg import Profile as ProfileMessage
+from piezo_gripper_msgs.msg import Sample
+
+
+class ProfileInput:
+    """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k."""
+
+    def __init__(self, node: Node, topic: str, sample_time: float) -> None:
+        self._node = node
+        self._topic = topic
+        self._sampled = SampledProfile(Profile([0.0], [0.0]), sample_time)
+        node.create_subscription(Sample, topic, self._on_value, SETPOINT)
+        node.create_subscription(ProfileMessage, f"{topic}_profile", self._on_profile, LATCHED)
+
+    def __getitem__(self, number: int) -> float:
+        return self._sampled[number]
+
+    def restart(self, sample_time: float) -> None:
+        """Read the same signal at another sample time."""
+        self._sampled = SampledProfile(self._sampled.profile, sample_time)
+
+    def _on_value(self, sample: Sample) -> None:
+        self._take(self._topic, [0.0], [sample.value], linear=False)
+
+    def _on_profile(self, message: ProfileMessage) -> None:
+        linear = message.interpolation == ProfileMessage.LINEAR
+        self._take(f"{self._topic}_profile", message.time, message.value, linear)
+
+    def _take(self, topic: str, time: list[float], value: list[float], linear: bool) -> None:
+        try:
+            profile = Profile(time, value, linear)
+        except ValueError as error:
+            self._node.get_logger().error(f"'{topic}' ignored: {error}")
+            return
+        self._sampled = SampledProfile(profile, self._sampled.sample_time)

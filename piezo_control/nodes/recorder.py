@@ -1,0 +1,194 @@
+"""Records a finger's topics into a rosbag2 folder (MCAP), message definitions included.
+
+in:  the topics of `topics`: the finger's own, or any that somebody publishes
+out: recorder_state (RecorderState)
+
+A recording begins at activation and is finished, readable, at deactivation, shutdown, SIGINT and
+SIGTERM. Numbered samples are written once each, whatever the transport repeats; numbers never seen are
+counted as missing. A message's time in the bag is its own stamp, so a lock-step run replays at the
+finger's speed. A run that starts again at sample 0 goes on in the same bag.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import struct
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.interfaces import Connection
+
+from piezo_control.nodes import base as finger_node
+from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.parameters import parameter
+from piezo_control.recording.recording import PROFILE_TYPE, SAMPLE_TYPE, TEMPERATURE_TYPE
+from piezo_control.recording.writer import BagWriter
+from piezo_gripper_msgs.msg import RecorderState
+
+FINGER = {
+    "reference": (SAMPLE_TYPE, SAMPLE),
+    "reference_profile": (PROFILE_TYPE, LATCHED),
+    "deflection": (SAMPLE_TYPE, SAMPLE),
+    "command": (SAMPLE_TYPE, SAMPLE),
+    "voltage": (SAMPLE_TYPE, SAMPLE),
+    "temperature": (TEMPERATURE_TYPE, SAMPLE),
+    "tip_force": (SAMPLE_TYPE, SAMPLE),
+    "tip_force_profile": (PROFILE_TYPE, LATCHED),
+    "state": ("piezo_gripper_msgs/msg/FingerState", LATCHED),
+}
+SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
+STATE_PERIOD = 0.05  # s
+
+
+@dataclasses.dataclass(frozen=True)
+class RecorderParameters:
+    """Where to write, and what."""
+
+    bag: str = parameter("", "folder to write, new; empty: 'finger_' and the time in this folder")
+    topics: tuple[str, ...] = parameter(tuple(FINGER), "topics to record, relative or absolute")
+
+
+class Track:
+    """One recorded topic: its connection in the bag and the count of its samples."""
+
+    def __init__(self, topic: str, connection: Connection, has_header: bool) -> None:
+        self.connection = connection
+        self.has_header = has_header
+        self.is_numbered = connection.msgtype == SAMPLE_TYPE and topic not in SET_POINTS
+        self.is_stamped = connection.msgtype == TEMPERATURE_TYPE
+        self.last = -1
+        self.recorded = 0
+        self.duplicates = 0
+        self.missing = 0
+
+
+def sample_number(data: bytes) -> int:
+    """Return the field `number` of a serialized Sample (little-endian CDR)."""
+    (frame_id,) = struct.unpack_from("<I", data, 12)
+    return struct.unpack_from("<Q", data, 4 + (12 + frame_id + 7) // 8 * 8)[0]
+
+
+class RecorderNode(FingerNode):
+    NAME = "recorder"
+    PARAMETERS = RecorderParameters
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.states = self.create_publisher(RecorderState, "recorder_state", LATCHED)
+        self.create_timer(STATE_PERIOD, self._publish_state)
+        self.writer: BagWriter | None = None
+        self.inputs: list[Any] = []
+        self.latched: dict[str, bytes] = {}
+        self.tracks: dict[str, Track] = {}
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe, so that every publisher knows the recorder before a run begins."""
+        try:
+            types = {topic: self._type(topic) for topic in self.parameters.topics}
+        except ValueError as error:
+            self.get_logger().error(f"not configured: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self.types = types
+        for topic, (name, qos) in types.items():
+            package, _, kind = name.split("/")
+            message = getattr(importlib.import_module(f"{package}.msg"), kind)
+            write = partial(self._write, topic)
+            self.inputs.append(self.create_subscription(message, topic, write, qos, raw=True))
+        return super().on_configure(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        while self.inputs:
+            self.destroy_subscription(self.inputs.pop())
+        self.latched.clear()
+        return super().on_cleanup(state)
+
+    def start(self) -> None:
+        bag = Path(self.parameters.bag or time.strftime("finger_%Y-%m-%d_%H-%M-%S"))
+        writer = BagWriter(bag)
+        self.tracks = {}
+        for topic, (name, qos) in self.types.items():
+            connection = writer.add(self.resolve_topic_name(topic), name, qos)
+            self.tracks[topic] = Track(topic, connection, writer.has_header(name))
+        self.writer = writer
+        for topic, data in self.latched.items():
+            self._write(topic, data)
+
+    def stop(self) -> None:
+        writer, self.writer = self.writer, None
+        writer.close()
+        counts = ", ".join(f"{topic} {t.recorded}" for topic, t in self.tracks.items())
+        self.get_logger().info(f"wrote {writer.path}: {counts}")
+
+    def _type(self, topic: str) -> tuple[str, QoSProfile]:
+        """Return message type and quality of service to subscribe `topic` with."""
+        offers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+        if topic in FINGER and not offers:
+            return FINGER[topic]
+        if not offers:
+            raise ValueError(f"'topics' has '{topic}', which nobody publishes: type unknown")
+        profiles = [offer.qos_profile for offer in offers]
+        best_effort = any(p.reliability == ReliabilityPolicy.BEST_EFFORT for p in profiles)
+        latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+        qos = QoSProfile(
+            depth=SAMPLE.depth,
+            reliability=ReliabilityPolicy.BEST_EFFORT
+            if best_effort
+            else ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        return offers[0].topic_type, qos
+
+    def _write(self, topic: str, data: bytes) -> None:
+        if self.types[topic][1].durability == DurabilityPolicy.TRANSIENT_LOCAL:
+            self.latched[topic] = (
+                data  # what a profile said before the run began belongs to the run
+            )
+        if self.writer is None:
+            return
+        track = self.tracks[topic]
+        if track.has_header:
+            seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+            stamp = seconds * 10**9 + nanoseconds
+        else:
+            stamp = self.get_clock().now().nanoseconds
+        if track.is_numbered and not self._is_new(track, sample_number(data)):
+            return
+        if track.is_stamped and stamp <= track.last:
+            track.duplicates += 1
+            return
+        if track.is_stamped:
+            track.last = stamp
+        self.writer.write(track.connection, stamp, data)
+        track.recorded += 1
+
+    def _is_new(self, track: Track, number: int) -> bool:
+        """Count sample `number` of a topic and say whether it has not been written yet."""
+        if number == 0 and track.last > 0:
+            for other in self.tracks.values():
+                other.last = -1
+        if number <= track.last:
+            track.duplicates += 1
+            return False
+        track.missing += number - track.last - 1
+        track.last = number
+        return True
+
+    def _publish_state(self) -> None:
+        tracks = self.tracks
+        state = RecorderState(topics=list(tracks))
+        state.header.stamp = self.get_clock().now().to_msg()
+        state.bag = str(self.writer.path) if self.writer else ""
+        state.recorded = [t.recorded for t in tracks.values()]
+        state.duplicates = [t.duplicates for t in tracks.values()]
+        state.missing = [t.missing for t in tracks.values()]
+        self.states.publish(state)
+
+
+def main() -> int:
+    return finger_node.run(RecorderNode)

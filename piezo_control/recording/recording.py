@@ -1,0 +1,176 @@
+"""A run of a finger as arrays over time, read from a bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from piezo_control.profile import Profile
+from piezo_control.recording.reader import Bag, BagError, open_bag
+
+__all__ = ["BagError", "Recording", "read"]
+
+SAMPLE_TYPE = "piezo_gripper_msgs/msg/Sample"
+PROFILE_TYPE = "piezo_gripper_msgs/msg/Profile"
+TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
+LINEAR = 1  # Profile.interpolation: straight lines
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Signals of one run of one finger, 1-D arrays of shape (n,), NaN where a signal was not recorded.
+
+    `time` counts in seconds from the first sample and `number` are the samples' numbers; deflection,
+    reference and command are in m, voltage in V, tip_force (external) in N, temperature in °C. Deflection
+    k is what the sensor said at time[k]; command and voltage k are the answer to it, in force from then
+    on until the next.
+    """
+
+    number: NDArray[np.int64]
+    time: NDArray[np.float64]
+    reference: NDArray[np.float64]
+    deflection: NDArray[np.float64]
+    command: NDArray[np.float64]
+    voltage: NDArray[np.float64]
+    temperature: NDArray[np.float64]
+    tip_force: NDArray[np.float64]
+
+    @property
+    def sample_time(self) -> float:
+        """Time from sample to sample in s: the median, in whole nanoseconds."""
+        return _period(self.time, self.number)
+
+
+def read(
+    path: str | Path, finger: str = "", run: int | None = None, partial: bool = False
+) -> Recording:
+    """Read a run from a rosbag2 folder (MCAP or SQLite), or from one such storage file.
+
+    Samples are brought in line by their numbers; those that a topic does not have are NaN, repeated
+    ones count once. References and tip forces are evaluated from their profile or held from set-point to
+    set-point, temperatures are held from stamp to stamp.
+
+    Parameters
+    ----------
+    path : str or Path
+        Written by the recorder node, the engine or ``ros2 bag record``; stamps may be simulated time or
+        that of a wall clock.
+    finger : str
+        Namespace; may be left out when the bag holds one finger.
+    run : int, optional
+        Which run, from 0, of a bag in which the numbers of the samples start again.
+    partial : bool
+        Take what there is of a damaged bag instead of raising BagError.
+
+    Raises
+    ------
+    BagError
+        If this is no bag or a damaged one, holds no deflection, holds several fingers or runs and none
+        was named, or a topic has another message type than a finger's. The message says what is there.
+    """
+    bag = open_bag(path)
+    if bag.damage and not partial:
+        raise BagError(
+            f"{path}: {bag.damage}; could be read: {bag.content()}; to use that, ask for a partial reading"
+        )
+    topic = _deflection_topic(bag, finger)
+    prefix = topic[: -len("deflection")]
+    deflection = _choose_run(bag, topic, bag.messages(topic, SAMPLE_TYPE), run)
+    number, first = np.unique([m.number for m in deflection], return_index=True)
+    stamps = np.array([_seconds(deflection[i].header.stamp) for i in first])
+    period = _period(stamps, number)
+    signals = {
+        name: _signal(bag, prefix + name, stamps, number * period)
+        for name in ("reference", "tip_force")
+    }
+    sampled = {
+        name: _align(number, bag.messages(prefix + name, SAMPLE_TYPE), stamps)
+        for name in ("command", "voltage")
+    }
+    warmth = bag.messages(f"{prefix}temperature", TEMPERATURE_TYPE)
+    recording = Recording(
+        number=number,
+        time=stamps - stamps[0],
+        deflection=np.array([deflection[i].value for i in first]),
+        temperature=_held(
+            [_seconds(m.header.stamp) for m in warmth], [m.temperature for m in warmth], stamps
+        ),
+        **sampled,
+        **signals,
+    )
+    return _without_ragged_end(recording) if bag.damage else recording
+
+
+def _without_ragged_end(recording: Recording) -> Recording:
+    """Cut off the last samples, for which some of the signals that were recorded are missing."""
+    signals = {f.name: getattr(recording, f.name) for f in fields(recording)}
+    present = [np.flatnonzero(np.isfinite(signal)) for signal in signals.values()]
+    end = min(samples[-1] + 1 for samples in present if samples.size)
+    return Recording(**{name: signal[:end] for name, signal in signals.items()})
+
+
+def _deflection_topic(bag: Bag, finger: str) -> str:
+    found = [topic for topic in bag.topics if topic.split("/")[-1] == "deflection"]
+    if finger:
+        found = [topic for topic in found if topic == f"/{finger.strip('/')}/deflection"]
+    if len(found) != 1:
+        which = "several fingers, name one of" if found else f"no topic '{finger}/deflection' in"
+        raise BagError(f"{bag.path}: {which}: {bag.content()}")
+    if not bag.topics[found[0]].data:
+        raise BagError(f"{bag.path}: topic '{found[0]}' has no messages; there is: {bag.content()}")
+    return found[0]
+
+
+def _choose_run(bag: Bag, topic: str, samples: list[Any], run: int | None) -> list[Any]:
+    """Return the samples of one run; where numbers go back, another one begins."""
+    number = np.array([m.number for m in samples])
+    begins = [0, *np.flatnonzero(np.diff(number) < 0) + 1, number.size]
+    count = len(begins) - 1
+    if run is None and count > 1 or run is not None and not 0 <= run < count:
+        raise BagError(
+            f"{bag.path}: topic '{topic}' has {count} runs (numbered from 0), and run {run} was asked for"
+        )
+    return samples[begins[run or 0] : begins[(run or 0) + 1]]
+
+
+def _period(time: NDArray, number: NDArray) -> float:
+    if number.size < 2:
+        return 0.0
+    return round(float(np.median(np.diff(time) / np.diff(number))) * 1e9) / 1e9
+
+
+def _seconds(stamp: Any) -> float:
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def _align(number: NDArray, samples: list[Any], stamps: NDArray) -> NDArray[np.float64]:
+    """Return the values of the sample `number`s, looked for between the first and the last stamp."""
+    values = {
+        m.number: m.value for m in samples if stamps[0] <= _seconds(m.header.stamp) <= stamps[-1]
+    }
+    return np.array([values.get(n, np.nan) for n in number.tolist()])
+
+
+def _signal(bag: Bag, name: str, stamps: NDArray, elapsed: NDArray) -> NDArray[np.float64]:
+    """Evaluate a signal that came as a profile (over the time `elapsed`) or else as set-points."""
+    profiles = bag.messages(f"{name}_profile", PROFILE_TYPE)
+    if profiles:
+        last = profiles[-1]
+        return Profile(last.time, last.value, last.interpolation == LINEAR).at(elapsed)
+    points = bag.messages(name, SAMPLE_TYPE)
+    received = bag.topics[name].stamps if points else []
+    instants = [_seconds(m.header.stamp) or ns * 1e-9 for m, ns in zip(points, received)]
+    return _held(instants, [m.value for m in points], stamps)
+
+
+def _held(instants: list[float], values: list[float], stamps: NDArray) -> NDArray[np.float64]:
+    """Return what was newest at each of `stamps`, NaN before the first."""
+    if not instants:
+        return np.full(stamps.shape, np.nan)
+    order = np.argsort(instants, kind="stable")
+    index = np.searchsorted(np.array(instants)[order], stamps + 1e-9, side="right") - 1
+    return np.where(index >= 0, np.array(values)[order][np.maximum(index, 0)], np.nan)

@@ -1,0 +1,145 @@
+"""Writes rosbag2 folders (MCAP) with message definitions: for the recorder node and for the engine."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from ament_index_python.packages import get_package_share_directory
+from rclpy.qos import QoSProfile
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.profile import Profile
+from piezo_control.recording.recording import (
+    LINEAR,
+    PROFILE_TYPE,
+    SAMPLE_TYPE,
+    TEMPERATURE_TYPE,
+    Recording,
+)
+
+SAMPLE_CDR = struct.Struct(
+    "<4s i I I 4x Q d"
+)  # encapsulation, stamp, empty frame_id, number, value
+LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+
+
+class BagWriter:
+    """A rosbag2 folder being written; it is readable after :meth:`close`.
+
+    Raises ValueError when the folder exists or cannot be made.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if self.path.exists():
+            raise ValueError(f"'bag' is '{path}', which exists; name a new folder")
+        self.typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise ValueError(f"'bag' is '{path}', which cannot be written: {error}") from None
+
+    def add(self, topic: str, kind: str, qos: QoSProfile) -> Connection:
+        """Add a topic of message type `kind`; players will offer it with `qos`."""
+        self._learn(kind)
+        return self._writer.add_connection(
+            topic, kind, typestore=self.typestore, offered_qos_profiles=[_bag_qos(qos)]
+        )
+
+    def write(self, connection: Connection, stamp: int, data: bytes) -> None:
+        """Write one serialized message with the bag's time stamp (ns)."""
+        self._writer.write(connection, stamp, data)
+
+    def close(self) -> None:
+        """Finish the folder."""
+        self._writer.close()
+
+    def has_header(self, kind: str) -> bool:
+        """Say whether messages of type `kind` begin with a std_msgs/Header."""
+        fields = self.typestore.fielddefs[kind][1]
+        return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+    def _learn(self, kind: str) -> None:
+        """Register message `kind` and the other messages of its package, unless it is known."""
+        if kind in self.typestore.types:
+            return
+        package = kind.split("/")[0]
+        types = {}
+        for path in (Path(get_package_share_directory(package)) / "msg").glob("*.msg"):
+            types.update(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
+        self.typestore.register(types)
+
+
+def write_recording(
+    path: str | Path, finger: str, recording: Recording, reference: Profile, tip_force: Profile
+) -> None:
+    """Write a run as the recorder node would have: topics of `finger`, stamps in simulated time.
+
+    Temperatures are written where they change, reference and tip force as their profiles.
+    """
+    bag = BagWriter(path)
+    for name, profile in (("reference", reference), ("tip_force", tip_force)):
+        topic = bag.add(f"/{finger}/{name}_profile", PROFILE_TYPE, LATCHED)
+        bag.write(topic, 0, _profile(bag, profile))
+    stamps = np.rint(recording.time * 1e9).astype(int).tolist()
+    signals = [
+        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE, SAMPLE), getattr(recording, name).tolist())
+        for name in ("deflection", "command", "voltage")
+    ]
+    warmth = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE, SAMPLE)
+    changes = set(np.flatnonzero(np.diff(recording.temperature, prepend=np.nan)).tolist())
+    for k, (number, stamp) in enumerate(zip(recording.number.tolist(), stamps)):
+        if k in changes:
+            bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
+        for topic, values in signals:
+            data = SAMPLE_CDR.pack(LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, values[k])
+            bag.write(topic, stamp, data)
+    bag.close()
+
+
+def _profile(bag: BagWriter, profile: Profile) -> bytes:
+    message = bag.typestore.types[PROFILE_TYPE](
+        _header(bag, 0), LINEAR if profile.linear else 0, profile.time, profile.value
+    )
+    return bytes(bag.typestore.serialize_cdr(message, PROFILE_TYPE))
+
+
+def _temperature(bag: BagWriter, stamp: int, degc: float) -> bytes:
+    message = bag.typestore.types[TEMPERATURE_TYPE](_header(bag, stamp), degc, 0.0)
+    return bytes(bag.typestore.serialize_cdr(message, TEMPERATURE_TYPE))
+
+
+def _header(bag: BagWriter, stamp: int) -> object:
+    types = bag.typestore.types
+    return types["std_msgs/msg/Header"](
+        types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), ""
+    )
+
+
+def _bag_qos(qos: QoSProfile) -> Qos:
+    forever = QosTime(2147483647, 4294967295)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        qos.depth,
+        QosReliability(int(qos.reliability)),
+        QosDurability(int(qos.durability)),
+        forever,
+        forever,
+        QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )

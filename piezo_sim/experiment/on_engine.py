@@ -1,0 +1,36 @@
+"""Runs cases on the engine, in this process, and writes the bag that the recorder would have written."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from rich.progress import Progress
+
+from piezo_control.recording.writer import write_recording
+from piezo_sim import engine
+from piezo_sim.experiment.cases import Case
+from piezo_sim.experiment.on_nodes.runner import Run
+
+
+def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> Run:
+    """Run one case; its bag goes to `out`/bags."""
+    bag = out / "bags" / case.name
+    task = progress.add_task(f"{case.name} (engine)", total=case.samples)
+    parameters = case.parameters(bag)
+    begin = time.monotonic()
+    made = engine.run(
+        parameters["cantilever"],
+        parameters["feedforward"],
+        parameters["feedback"],
+        parameters["temperature"],
+        case.reference,
+        case.samples,
+        case.tip_force,
+        every=case.every,
+    )
+    seconds = time.monotonic() - begin
+    bag.parent.mkdir(parents=True, exist_ok=True)
+    write_recording(bag, finger, made, case.reference, case.tip_force)
+    progress.update(task, completed=case.samples)
+    return Run(case, bag, case.samples / seconds, processes=1)

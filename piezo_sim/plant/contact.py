@@ -1,0 +1,92 @@
+"""Contact of the tip with an object: a spring and a damper behind a free play, pushing only.
+
+With the deflection delta = x + b (x behind D(s), b = g(T) + Creep) and the penetration
+p = delta - free_play, the force on the tip is F = -(stiffness p + damping p') while p > 0 and F < 0,
+else zero. A stiff object held for one sample would feed energy into the vibration, so the contact
+is part of the equation of motion,
+
+    a2 x'' + (a1 + s_p damping) x' + (1 + s_p stiffness) x
+        = H_s(U) + s_p F_external - s_p stiffness (b - free_play),
+
+stepped as exactly as the free tip. With an object in front, every sample is split into parts that are
+each in or out of contact, PART radians of the vibration in contact at most.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from piezo_control.dynamics import DynamicsParameters, Propagator, move, propagator
+from piezo_control.parameters import parameter
+
+PART = 0.05
+
+
+@dataclass(frozen=True)
+class ContactParameters:
+    """Object in front of the tip, on the side of positive deflection; stiffness 0: none."""
+
+    stiffness: float = parameter(
+        0.0, "stiffness of the object; 0: nothing to touch", unit="N/m", low=0.0, high=1e5
+    )
+    damping: float = parameter(
+        0.0, "damping of the object in contact", unit="N s/m", low=0.0, high=1e3
+    )
+    free_play: float = parameter(
+        5e-6, "deflection at which the tip touches", unit="m", low=-1e-3, high=1e-3
+    )
+
+
+class Tip(NamedTuple):
+    """Motion of the tip over one of `parts` parts of a sample, free and in contact."""
+
+    parts: int
+    free: Propagator
+    touching: Propagator
+    stiffness: float
+    damping: float
+    free_play: float
+    elastic_constant: float
+
+
+def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_time: float) -> Tip:
+    """Return the tip's exact motion for one sample time (s)."""
+    inertia, damping, stiffness = dynamics.denominator
+    softness = dynamics.elastic_constant
+    total_damping = damping + softness * contact.damping
+    total_stiffness = stiffness + softness * contact.stiffness
+    parts = 1
+    if contact.stiffness > 0.0:
+        parts = math.ceil(sample_time * math.sqrt(total_stiffness / inertia) / PART)
+    return Tip(
+        parts,
+        propagator(inertia, damping, stiffness, sample_time / parts),
+        propagator(inertia, total_damping, total_stiffness, sample_time / parts),
+        contact.stiffness,
+        contact.damping,
+        contact.free_play,
+        softness,
+    )
+
+
+def contact_force(tip: Tip, deflection: float, speed: float) -> float:
+    """Return the object's force on the tip (N), zero or negative."""
+    if tip.stiffness == 0.0 or deflection <= tip.free_play:
+        return 0.0
+    return min(0.0, -tip.stiffness * (deflection - tip.free_play) - tip.damping * speed)
+
+
+def move_tip(motion, tip: Tip, target: float, offset: float) -> None:
+    """Advance `motion` = [x, v] by one sample.
+
+    `target` is H_s(U) + s_p F_external, `offset` is b = g(T) + Creep, both held within the sample (m).
+    """
+    compliance = tip.elastic_constant * tip.stiffness
+    held = (target - compliance * (offset - tip.free_play)) / (1.0 + compliance)
+    for _ in range(tip.parts):
+        if contact_force(tip, motion[0] + offset, motion[1]) < 0.0:
+            move(motion, tip.touching, held)
+        else:
+            move(motion, tip.free, target)

@@ -1,0 +1,141 @@
+"""The command line: from bags and text files to parameters that linearise the finger they came from."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.identification.cli import main
+from piezo_control.identification.excitation import decaying_sine
+from piezo_control.parameters import build, load
+from piezo_control.profile import Profile
+from piezo_control.recording.writer import write_recording
+from piezo_sim.engine import drive, run
+from piezo_sim.plant.cantilever import CantileverParameters
+from piezo_sim.plant.creep import CreepParameters
+from piezo_sim.temperature import TemperatureParameters
+
+P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"
+P885_COLUMNS = ("--voltage", "0", "--deflection", "4:um", "--sample-rate", "200", "--skip", "400")
+CONSTANT = TemperatureParameters(profile="constant", base_degc=22.0)
+ZERO = Profile([0.0], [0.0])
+
+
+@pytest.fixture
+def identify(monkeypatch, tmp_path):
+    """Run the command line with results in a folder of the test; return its exit code."""
+
+    def call(*arguments):
+        command = ["identify", *map(str, arguments), "--out", str(tmp_path / "identified")]
+        monkeypatch.setattr(sys, "argv", command)
+        return main()
+
+    return call
+
+
+def recorded(bag, plant, voltage, duration, tip_force=ZERO):
+    """Drive the cantilever in the engine and write what the recorder would have written."""
+    samples = round(duration / plant.sample_time)
+    result = drive(plant, CONSTANT, voltage, samples, tip_force=tip_force)
+    write_recording(bag, "finger", result, voltage, tip_force)
+    return bag
+
+
+def test_excite_identify_linearise_a_plant_of_another_class(identify, tmp_path):
+    """The whole chain: the loaded parameters keep 1 Hz, +-20 um within 2.5 % of the stroke."""
+    plant = CantileverParameters(plant="truth", sample_time=1e-3)
+    bag = recorded(tmp_path / "excite", plant, decaying_sine(40.0, cycles=20), 20.0)
+    assert identify("hysteresis", bag) == 0
+    path = tmp_path / "identified" / "feedforward.yaml"
+    identified = build(FeedforwardParameters, load(path, "feedforward"), str(path))
+
+    time = np.arange(3001) * 1e-3
+    reference = Profile(time, 20e-6 * np.sin(2.0 * np.pi * time), linear=True)
+    peak = {}
+    for name, feedforward in (
+        ("inverse", identified),
+        ("static_gain", FeedforwardParameters("static_gain", identified.static_gain)),
+    ):
+        result = run(plant, feedforward, FeedbackParameters(), CONSTANT, reference, 3000)
+        error = np.abs(result.true_deflection - np.roll(result.reference, 1))
+        peak[name] = 100.0 * error[1000:].max() / 40e-6  # after the first of three cycles
+    assert peak["inverse"] <= 2.5
+    assert peak["static_gain"] > 7.0
+
+
+def test_every_step_ends_in_one_cantilever_file(identify, tmp_path):
+    """Hysteresis, D(s) and elastic constant of the default finger, each from a bag of its own."""
+    quick = CantileverParameters()
+    slow = replace(quick, sample_time=1e-3, creep=CreepParameters(gain=0.0))
+    excited = recorded(tmp_path / "excite", slow, decaying_sine(40.0, cycles=20), 20.0)
+    stepped = recorded(tmp_path / "step", quick, Profile([0.0, 2e-3], [0.0, 40.0]), 0.08)
+    pushed = recorded(tmp_path / "push", quick, ZERO, 0.1, Profile([0.0, 2e-3], [0.0, 1e-3]))
+    thresholds = ",".join(map(str, quick.hysteresis.thresholds))
+    assert identify("hysteresis", excited, "--model", "classical", "--thresholds", thresholds) == 0
+    assert identify("dynamics", stepped) == 0
+    assert identify("stiffness", pushed) == 0
+
+    out = tmp_path / "identified"
+    path = out / "cantilever.yaml"
+    found = build(CantileverParameters, load(path, "cantilever"), str(path))
+    np.testing.assert_allclose(found.hysteresis.weights, quick.hysteresis.weights, rtol=0.02)
+    assert found.dynamics.denominator == pytest.approx(quick.dynamics.denominator, rel=0.01)
+    assert found.dynamics.elastic_constant == pytest.approx(3.1e-3, rel=0.005)
+    assert found.creep == quick.creep
+    comments = [line for line in path.read_text().splitlines() if line.startswith("#")]
+    assert [word in "\n".join(comments) for word in ("excite", "step", "push")] == [True] * 3
+    for picture in ("hysteresis.png", "dynamics.png", "stiffness.png"):
+        assert (out / picture).stat().st_size > 10_000
+
+
+def test_creep_and_heat_from_two_bags(identify, tmp_path):
+    plant = CantileverParameters(sample_time=2e-2)
+    step = Profile([0.0, 1.0], [0.0, 40.0])
+    bags = []
+    for degc in (22.0, 32.0):
+        temperatures = TemperatureParameters(profile="constant", base_degc=degc)
+        bags.append(tmp_path / f"creep_{degc:g}")
+        result = drive(plant, temperatures, step, 15_000)
+        write_recording(bags[-1], "finger", result, step, ZERO)
+    assert identify("drift", *bags) == 0
+    path = tmp_path / "identified" / "cantilever.yaml"
+    found = build(CantileverParameters, load(path, "cantilever"), str(path))
+    assert found.creep.gain == pytest.approx(plant.creep.gain, rel=0.05)
+    assert found.creep.gain_per_degc == pytest.approx(plant.creep.gain_per_degc, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("model", "plays", "limit"), [("classical", 10, 0.90), ("modified", 20, 0.50)]
+)
+def test_measured_actuator_from_its_file(identify, tmp_path, model, plays, limit):
+    assert identify("hysteresis", P885, *P885_COLUMNS, "--model", model, "--plays", plays) == 0
+    fits = json.loads((tmp_path / "identified" / "hysteresis.json").read_text())
+    assert fits["all 7627 samples, fitted"]["rms_percent"] <= limit
+    assert fits["last 2288 samples, held back"]["rms_percent"] <= 0.95
+    assert identify("check", P885, *P885_COLUMNS) == 0
+    again = json.loads((tmp_path / "identified" / "check.json").read_text())
+    assert again["rms_percent"] == pytest.approx(
+        fits["all 7627 samples, fitted"]["rms_percent"], rel=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("hysteresis", P885), "Model_Vi_Do.dat: no column for 'voltage'; the file has 0, 1, 2"),
+        (("hysteresis", P885, "--voltage", "9", "--deflection", "4"), "no column '9' for 'voltage'"),
+        (("hysteresis", P885, *P885_COLUMNS, "--deflection", "1"), "column 'deflection' is 0 in all"),
+        (("hysteresis", P885, *P885_COLUMNS, "--thresholds", "0,2"), "threshold 2 V never comes into"),
+        (("stiffness", P885, *P885_COLUMNS[:-2]), "no column 'tip_force'"),
+        (("check", P885, *P885_COLUMNS), "feedforward.yaml: cannot be read"),
+        (("hysteresis", "none.csv"), "none.csv: cannot be read"),
+    ],
+)  # fmt: skip
+def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, arguments, message):
+    assert identify(*arguments) == 2
+    assert message in capsys.readouterr().err
