@@ -21,6 +21,7 @@ from rich.table import Table
 
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
+from piezo_control.identification import plots as plots
 from piezo_control.identification.drift import identify_drift
 from piezo_control.identification.dynamics import identify_dynamics
 from piezo_control.identification.hysteresis import (
@@ -31,7 +32,6 @@ from piezo_control.identification.hysteresis import (
     quality,
     settled,
 )
-from piezo_control.identification import plots as plots
 from piezo_control.identification.measurement import (
     QUANTITIES,
     Measurement,
