@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # Source this in bash after `make env` (`. ./setup.bash`): the nodes then start by name, as in `cantilever --help`.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)

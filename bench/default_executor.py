@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One of the package's nodes on rclpy's default executor with default settings, to compare with."""
 
 import sys

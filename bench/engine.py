@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Speed of the engine: against the same loop in C, over a long run, over many draws.
 
 Each function returns rows ``{"name", "value", "unit", "reference", "ratio"}``; `reference` is what was

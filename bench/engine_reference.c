@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: Apache-2.0
 /* The closed loop of piezo_sim/engine.py in plain C: the yardstick of the engine's speed.
  *
  * Same order of operations, so the samples are the same to rounding. Only what the benchmark runs is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Speed of the loop over topics: against the default executor, against a bare ring, free-running.
 
 Each function returns rows ``{"name", "value", "unit", "reference", "ratio"}``, measured in turns with

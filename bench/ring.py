@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A bare ring of processes: wait on one subscription, take the message, publish the next one.
 
 `ring.py HOPS INDEX SECONDS`; process 0 sends the first message, counts the turns, and prints how many

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measures the speed of everything and writes out/bench.json, out/bench.html and the jitter's histogram.
 
 Every row is a ratio against a reference measured in the same run, or against the limit it must keep;

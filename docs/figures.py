@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Makes the pictures of the README, small PNGs in this folder, from the results of `make paper`.
 
 python docs/figures.py out/paper

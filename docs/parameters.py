@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes docs/parameters.md, the tables of every node's parameters, from their declarations."""
 
 from pathlib import Path

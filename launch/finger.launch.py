@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One finger: cantilever, temperature, feedforward and feedback, started and active in one namespace."""
 
 from launch import LaunchDescription

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A gripper: two fingers in the namespaces left and right, and the action server in front of them."""
 
 from launch import LaunchDescription

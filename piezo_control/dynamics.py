@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Vibration of the cantilever: D(s) = 1 / (a2 s² + a1 s + 1), stepped exactly.
 
 Source: paper eq. 3-5. The actuated deflection and the elastic deflection s_p F share D(s), so both

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run-time feedback law: a discrete state-space controller with two degrees of freedom.
 
     e_k     = reference_k - deflection_k

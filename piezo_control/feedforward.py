@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Feedforward: the voltage that leads a hysteretic finger to a commanded deflection.
 
 The compensator is the inverse hysteresis of :mod:`piezo_control.hysteresis` or, to compare with, a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two fingers as one gripper: from a wanted opening to two references, and when the motion is over.
 
     opening = rest_opening - (deflection_left + deflection_right)

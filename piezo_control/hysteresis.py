@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prandtl-Ishlinskii hysteresis of a piezo actuator and its exact analytic inverse.
 
 The operator is a weighted sum of plays, seen through memoryless one-sided dead zones::

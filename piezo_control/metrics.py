@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures that describe a response: settling, overshoot, static error, loop width, band, rejection.
 
 Every figure is defined in its docstring. Times of a step response are measured from the step, its

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters as data: type, default, unit, range and meaning of every value in one place.
 
 A law declares its parameters as a frozen dataclass whose fields come from :func:`parameter`; nested

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A signal that travels ahead of its use: points in time, held or joined by straight lines."""
 
 from __future__ import annotations

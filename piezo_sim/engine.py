@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop in one process: the step functions of the nodes, one after the other, without ROS.
 
 Per sample k, as over topics: the sensor reads, feedback turns reference and reading into a command,

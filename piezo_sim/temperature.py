@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Temperature of the workspace over time, on the grid n * period.
 
 Every profile is a function of the grid index alone: the same parameters give the same value of sample n,

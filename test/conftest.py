@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every test session has a ROS domain of its own and stays on this machine."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Amplifier: clip, slew rate, bandwidth, each against its definition."""
 
 import math

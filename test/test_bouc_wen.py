@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bouc-Wen steps against the differential equation, and the loop the paper shows."""
 
 import numpy as np

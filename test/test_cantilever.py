@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The composed plant: against an independent integration, and against the paper's figures."""
 
 import dataclasses

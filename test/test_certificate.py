@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The certificate against python-control, the paper's figures, and claims that are not true."""
 
 import dataclasses

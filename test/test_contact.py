@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contact: against the differential equation with the force law of the module."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Creep against its closed forms: sums of exponentials, and the logarithm."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The generated page of parameters says what the code declares."""
 
 import runpy

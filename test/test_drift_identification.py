@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Creep and thermal deflection from the engine's long recordings at two temperatures."""
 
 import numpy as np

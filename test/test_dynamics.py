@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """D(s) stepped exactly, against the matrix exponential and the paper's figures."""
 
 import math

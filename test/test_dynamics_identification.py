@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """D(s) and the elastic constant from the simulated finger, seen through its sensor."""
 
 import math

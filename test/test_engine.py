@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The engine against the laws called one by one, as the nodes do, and its own bookkeeping."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The decaying sine: its shape, and that it homes a finger whatever its past."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's table: every number again, by formulas of this file's own, from the bags of shorter runs."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Run-time feedback law against its equation, its limits and hand-over."""
 
 import dataclasses

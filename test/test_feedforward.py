@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The feedforward law in front of the very operator it inverts, with and without limits."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The gripper: its law, and the action in front of two simulated fingers, with real processes."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The operator against the play's definition, and the inverse against the identity."""
 
 import math

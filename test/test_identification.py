@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hysteresis from recordings: known weights come back, and a measured actuator is described."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: from bags and text files to parameters that linearise the finger they came from."""
 
 import json

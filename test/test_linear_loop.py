@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The linear loop against independent simulation, closed forms and python-control."""
 
 import math

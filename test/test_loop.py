@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop over topics: real node processes, real bags."""
 
 import os

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading recordings: what is paired with what, and what is refused, by file, column and row."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of merit against closed forms of responses that can be written down."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Monte Carlo: what is drawn, that it can be interrupted, and that it refuses to mix studies."""
 
 from pathlib import Path

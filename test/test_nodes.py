@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Single nodes as a user meets them: the test plays the neighbours, over real topics."""
 
 import math

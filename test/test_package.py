@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The packages as built and installed: versions, dependencies, executables, data, messages."""
 
 import ast

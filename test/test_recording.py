@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reading of runs from bags: whole, damaged, foreign, from a wall clock."""
 
 import shutil

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The shipped `robust` controller on the nonlinear finger: hysteresis, creep, heat, sensor and delay."""
 
 import itertools

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensor: resolution, noise, delay, drop-outs."""
 
 import numpy as np

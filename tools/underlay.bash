@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # Sourced by setup.bash and bootstrap.sh with $root set: activates .venv and the ROS 2 below the checkout's own packages.
 
 prepend() {  # prepend VARIABLE PATH: put PATH first in the colon-separated VARIABLE, once

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Judge a controller by its closed loop alone: nothing a solver said is believed.
 
 Takes the coefficients of the feedback law and the design problem, closes the sampled loop around

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a design problem in YAML to a certified controller for `feedback`.
 
 The problem is a ROS parameter file for the node name `synthesize`: finger, uncertainty,

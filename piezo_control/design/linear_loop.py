@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The loop without its nonlinearities: one discrete controller around a whole box of fingers.
 
     finger:  gain D(s), D(s) = 1 / (a2 s² + a1 s + 1), sampled with a zero-order hold (exact)

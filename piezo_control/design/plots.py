@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of a controller: sensitivities and bounds, Nyquist, step responses, poles."""
 
 from __future__ import annotations

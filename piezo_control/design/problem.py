@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What `synthesize` is asked for: finger, uncertainty, specifications, and how to design.
 
 The same declarations read the YAML (layout of a ROS parameter file, node name `synthesize`).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a design problem to the coefficients of the feedback law.
 
 H-infinity chain: sampled finger with its delay (linear_loop) → w-plane by the bilinear transform,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From recordings of a finger to the parameters its nodes load.
 
 Reads rosbag2 folders and text files, and writes into one folder (--out), step by step:

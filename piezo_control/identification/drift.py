@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of creep and thermal deflection from long recordings.
 
 With the operator's static deflection H(U), the body's temperature theta behind the thermocouple's T,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of D(s) = 1 / (a2 s^2 + a1 s + 1) and of the gain in front of it.
 
 The model's output is compared, not its equation, so noise does not bias the damping::

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Excitation for the identification of hysteresis, and for homing: a sine whose amplitude decays.
 
 The first cycle goes to both ends and makes the plays forget what was before. Every further one turns

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Identification of the hysteresis operator from a measurement by constrained least squares.
 
 The plays' states z_i follow from the voltage alone, so the deflection is linear in the weights; the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurements to identify from, out of a rosbag2 folder or a text file, checked before use.
 
 Sample k pairs a deflection with the voltage that was held during the sample time *before* the instant

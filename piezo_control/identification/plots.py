@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of identifications: what was measured against what the model says."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What all nodes share: parameters from one dataclass, a lifecycle, a `run` that stops safely."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A block of the loop: one numbered sample in, one out, each answered exactly once.
 
 The rule that makes the loop deterministic whatever the transport does. A sample numbered one more than

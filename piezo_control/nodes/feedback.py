@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The block K of the paper's loop: from the deflection and the reference to the command.
 
 in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m)

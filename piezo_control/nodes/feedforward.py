@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The block H_s⁻¹ of the paper's loop: from the commanded deflection to the voltage.
 
 in:  command (Sample, m)

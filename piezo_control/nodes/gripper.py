@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Two fingers behind the action `grip`: bring them to an opening, or stop at a force.
 
 action: grip (Grip: opening m, max_force N, speed m/s)

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A signal that a node takes as single values or as a profile that travels ahead: the newest counts."""
 
 from __future__ import annotations

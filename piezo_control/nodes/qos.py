@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quality of service by role (REP-2003)."""
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Records a finger's topics into a rosbag2 folder (MCAP), message definitions included.
 
 in:  the topics of `topics`: the finger's own, or any that somebody publishes

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How every node of the package waits: one thread, one queue of events, a stop that can still publish.
 
 `rclpy.executors.SingleThreadedExecutor` rebuilds a wait set with every entity of the node for each

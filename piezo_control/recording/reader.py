@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of a rosbag2 recording, also of one that was cut off.
 
 A finished bag is read by `rosbags`. A recorder that was killed leaves no `metadata.yaml`, and a full

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A run of a finger as arrays over time, read from a bag."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Writes rosbag2 folders (MCAP) with message definitions: for the recorder node and for the engine."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From a recording to its figures of merit; everything here is computed from bags alone.
 
 There is one analysis per kind of experiment, a function of a recording that returns ``{quantity: value}``.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Analysis and comparison of bags from anywhere: this package, `ros2 bag record`, real hardware."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Named experiments: from a YAML description to cases, and from a case to the parameters of every node."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs a named experiment on real ROS 2 nodes: starts them, records, analyses, reports.
 
 Every figure is computed from the recorded bags; `analyse` and `compare` do the same for bags from anywhere.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Step responses over an uncertainty box: how a controller does on fingers that are not the nominal one.
 
 Resonance, damping and gain of the cantilever are drawn uniformly from a box; each draw is one run of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs cases on the engine, in this process, and writes the bag that the recorder would have written."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's figures and specification against what was measured here: one table.
 
 Source of what the paper asks and shows: Rakotondrabe, Diouf, Lutz (IFAC 2008). A line that the paper

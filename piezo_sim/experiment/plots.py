@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pictures of recordings, in the axes of the paper: ms, µm, V, rad/s, dB.
 
 Every kind of experiment has one function; `PLOTS` lists them. Each draws panels, a mapping of a title to

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A self-contained page of figures and tables, and the same tables on the terminal."""
 
 from __future__ import annotations

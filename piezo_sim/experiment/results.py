@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What an experiment has shown: figures of merit of every case, as tables, plots and metrics.json."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """All nodes of a simulated finger in one process, for the shortest way from block to block."""
 
 from __future__ import annotations

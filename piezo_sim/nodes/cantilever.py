@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The simulated piezocantilever with its amplifier and sensor: the block H_s·D(s) + b of the paper.
 
 in:  voltage (Sample, V), temperature (sensor_msgs/Temperature, °C),

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The disturbance of the paper: the temperature of the finger, a profile over time.
 
 in:  clock (rosgraph_msgs/Clock): in lock-step, the instant up to which temperatures are used up

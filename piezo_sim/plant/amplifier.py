@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Voltage amplifier: clip, slew rate, bandwidth.
 
 The demanded voltage is clipped to the limits, followed at the slew rate at most, and smoothed by a

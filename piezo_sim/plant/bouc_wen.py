@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Truth plant of another class: Bouc-Wen hysteresis, for judging models that are not it.
 
 Source: T. S. Low and W. Guo, Journal of MEMS 4 (1995), ref. 10 of the paper: deflection

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The piezocantilever: delta = H_s(U) D(s) + s_p F D(s) + g(T) + Creep(U, T)  (paper eq. 3-5).
 
 Each term is a module of its own; this one composes them, in the order of one sample:

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contact of the tip with an object: a spring and a damper behind a free play, pushing only.
 
 With the deflection delta = x + b (x behind D(s), b = g(T) + Creep) and the penetration

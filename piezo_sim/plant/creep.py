@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Creep: slow deflection after a voltage, amplified by temperature.
 
 Source: paper eq. 4 and Fig. 4. A sum of relaxations driven by the voltage,

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Laser sensor: noise, resolution, delay and drop-outs.
 
 A reading is the deflection plus white noise, rounded to the resolution. It comes out `delay_samples`

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Temperature of the cantilever's body, and what it does: g(T) and the change of the hysteresis.
 
 Source: paper eq. 2-4 with g(22 °C) = 0. Heat diffuses through the 0.3 mm thick cantilever, so the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conducts the nodes of one finger: parameters, lifecycle, profiles, and the wait for the end of a run."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Node processes: started together, watched, and never left behind."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Runs cases over topics: separate node processes, one bag per case."""
 
 from __future__ import annotations
