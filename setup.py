@@ -25,7 +25,7 @@ setup(
     package_data={"": ["*.html", "*.j2", "*.css"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
-        *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py")]),
+        *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py"), *glob("msg_defs/msg/*.msg")]),
     ],
     python_requires=">=3.10",
     install_requires=["setuptools"],

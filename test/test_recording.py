@@ -10,7 +10,6 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import SAMPLE_TYPE, BagError, Recording, read
 from piezo_control.recording.writer import LITTLE_ENDIAN, SAMPLE_CDR, BagWriter, write_recording
@@ -85,7 +84,7 @@ def test_cut_file_is_refused_and_then_read_as_far_as_it_goes(written, tmp_path, 
 def test_recorder_that_was_killed_leaves_a_readable_part(tmp_path):
     # Sample by sample, as the recorder writes; killed: neither close() nor metadata.yaml.
     bag = BagWriter(tmp_path / "killed")
-    topics = [bag.add(f"/f/{n}", SAMPLE_TYPE, SAMPLE) for n in ("deflection", "voltage")]
+    topics = [bag.add(f"/f/{n}", SAMPLE_TYPE) for n in ("deflection", "voltage")]
     for k in range(40_000):
         for topic in topics:
             bag.write(topic, k * 100_000, sample(k, k * 100_000, float(k)))
@@ -139,7 +138,7 @@ WALL = 1_764_000_000 * 10**9  # ns
 def hardware_bag(path: Path, plugin: StoragePlugin) -> None:
     """As `ros2 bag record` takes down a free-running finger: wall clock, jitter, repeats, set-points."""
     bag = BagWriter(path.with_name("types"))
-    bag.add("/f/deflection", SAMPLE_TYPE, SAMPLE)
+    bag.add("/f/deflection", SAMPLE_TYPE)
     rng = np.random.Generator(np.random.PCG64(5))
     jitter = rng.integers(-20_000, 20_000, 1000)
     with Writer(path, version=9, storage_plugin=plugin) as writer:
@@ -186,8 +185,8 @@ def test_sqlite_file_without_metadata(tmp_path):
 
 def test_several_runs_and_fingers_have_to_be_named(tmp_path):
     bag = BagWriter(tmp_path / "many")
-    left = bag.add("/left/deflection", SAMPLE_TYPE, SAMPLE)
-    right = bag.add("/right/deflection", SAMPLE_TYPE, SAMPLE)
+    left = bag.add("/left/deflection", SAMPLE_TYPE)
+    right = bag.add("/right/deflection", SAMPLE_TYPE)
     for run in range(2):
         for k in range(5):
             bag.write(left, (10 * run + k) * 10**6, sample(k, k * 10**6, float(run)))
@@ -207,4 +206,4 @@ def test_writer_refuses_an_existing_folder(tmp_path):
     with pytest.raises(ValueError, match="which exists"):
         BagWriter(tmp_path)
     with pytest.raises(ValueError, match="cannot be written"):
-        BagWriter("/proc/no/bag").add("/f/state", "std_msgs/msg/String", LATCHED)
+        BagWriter("/proc/no/bag").add("/f/state", "std_msgs/msg/String")

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ament_index_python.packages import get_package_share_directory
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection
@@ -114,7 +115,11 @@ class RecorderNode(FingerNode):
         writer = BagWriter(bag)
         self.tracks = {}
         for topic, (name, qos) in self.types.items():
-            connection = writer.add(self.resolve_topic_name(topic), name, qos)
+            if name not in writer.typestore.types:
+                package = name.split("/")[0]
+                writer.learn(package, Path(get_package_share_directory(package)))
+            latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            connection = writer.add(self.resolve_topic_name(topic), name, latched)
             self.tracks[topic] = Track(topic, connection, writer.has_header(name))
         self.writer = writer
         for topic, data in self.latched.items():

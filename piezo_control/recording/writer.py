@@ -7,8 +7,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-from ament_index_python.packages import get_package_share_directory
-from rclpy.qos import QoSProfile
 from rosbags.interfaces import (
     Connection,
     Qos,
@@ -21,7 +19,6 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import (
     LINEAR,
@@ -30,6 +27,7 @@ from piezo_control.recording.recording import (
     TEMPERATURE_TYPE,
     Recording,
 )
+from piezo_control.shared import shared_folder
 
 SAMPLE_CDR = struct.Struct(
     "<4s i I I 4x Q d"
@@ -48,18 +46,25 @@ class BagWriter:
         if self.path.exists():
             raise ValueError(f"'bag' is '{path}', which exists; name a new folder")
         self.typestore = get_typestore(Stores.ROS2_JAZZY)
+        self.learn("piezo_gripper_msgs", shared_folder() / "msg_defs")
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)
         try:
             self._writer.open()
         except OSError as error:
             raise ValueError(f"'bag' is '{path}', which cannot be written: {error}") from None
 
-    def add(self, topic: str, kind: str, qos: QoSProfile) -> Connection:
-        """Add a topic of message type `kind`; players will offer it with `qos`."""
-        self._learn(kind)
+    def add(self, topic: str, kind: str, latched: bool = False) -> Connection:
+        """Add a topic of message type `kind`; players offer a `latched` one to late subscribers too."""
         return self._writer.add_connection(
-            topic, kind, typestore=self.typestore, offered_qos_profiles=[_bag_qos(qos)]
+            topic, kind, typestore=self.typestore, offered_qos_profiles=[_offered(latched)]
         )
+
+    def learn(self, package: str, folder: Path) -> None:
+        """Register the messages of `package`, whose definitions are in `folder`/msg."""
+        types = {}
+        for path in (folder / "msg").glob("*.msg"):
+            types.update(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
+        self.typestore.register(types)
 
     def write(self, connection: Connection, stamp: int, data: bytes) -> None:
         """Write one serialized message with the bag's time stamp (ns)."""
@@ -74,16 +79,6 @@ class BagWriter:
         fields = self.typestore.fielddefs[kind][1]
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
 
-    def _learn(self, kind: str) -> None:
-        """Register message `kind` and the other messages of its package, unless it is known."""
-        if kind in self.typestore.types:
-            return
-        package = kind.split("/")[0]
-        types = {}
-        for path in (Path(get_package_share_directory(package)) / "msg").glob("*.msg"):
-            types.update(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
-        self.typestore.register(types)
-
 
 def write_recording(
     path: str | Path, finger: str, recording: Recording, reference: Profile, tip_force: Profile
@@ -94,14 +89,14 @@ def write_recording(
     """
     bag = BagWriter(path)
     for name, profile in (("reference", reference), ("tip_force", tip_force)):
-        topic = bag.add(f"/{finger}/{name}_profile", PROFILE_TYPE, LATCHED)
+        topic = bag.add(f"/{finger}/{name}_profile", PROFILE_TYPE, latched=True)
         bag.write(topic, 0, _profile(bag, profile))
     stamps = np.rint(recording.time * 1e9).astype(int).tolist()
     signals = [
-        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE, SAMPLE), getattr(recording, name).tolist())
+        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE), getattr(recording, name).tolist())
         for name in ("deflection", "command", "voltage")
     ]
-    warmth = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE, SAMPLE)
+    warmth = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE)
     changes = set(np.flatnonzero(np.diff(recording.temperature, prepend=np.nan)).tolist())
     for k, (number, stamp) in enumerate(zip(recording.number.tolist(), stamps)):
         if k in changes:
@@ -131,13 +126,14 @@ def _header(bag: BagWriter, stamp: int) -> object:
     )
 
 
-def _bag_qos(qos: QoSProfile) -> Qos:
+def _offered(latched: bool) -> Qos:
+    """Return the quality of service that players offer: reliable, and every sample or the newest."""
     forever = QosTime(2147483647, 4294967295)
     return Qos(
-        QosHistory.KEEP_LAST,
-        qos.depth,
-        QosReliability(int(qos.reliability)),
-        QosDurability(int(qos.durability)),
+        QosHistory.KEEP_LAST if latched else QosHistory.KEEP_ALL,
+        1 if latched else 0,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE,
         forever,
         forever,
         QosLiveliness.AUTOMATIC,

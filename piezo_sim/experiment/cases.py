@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from ament_index_python.packages import get_package_share_directory
 
 from piezo_control.identification.excitation import decaying_sine
 from piezo_control.nodes.feedback import FeedbackNodeParameters
@@ -19,6 +18,7 @@ from piezo_control.nodes.feedforward import FeedforwardNodeParameters
 from piezo_control.nodes.recorder import RecorderParameters
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
+from piezo_control.shared import shared_folder
 from piezo_sim.nodes.cantilever import CantileverNodeParameters
 from piezo_sim.nodes.temperature import TemperatureNodeParameters
 
@@ -121,9 +121,23 @@ class Case:
         return own if own and own.exists() else params_folder() / f"{name}.yaml"
 
 
+class RunFailed(RuntimeError):
+    """A run did not reach its end; the message names the node and what it said."""
+
+
+@dataclass(frozen=True)
+class CaseRun:
+    """A case that ran: its bag, and how fast and by how many processes."""
+
+    case: Case
+    bag: Path
+    steps_per_second: float
+    processes: int
+
+
 def params_folder() -> Path:
-    """Return the folder of the package's installed parameter files."""
-    return Path(get_package_share_directory("piezo_gripper")) / "params"
+    """Return the folder of the package's own parameter files."""
+    return shared_folder() / "params"
 
 
 def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[Case]]:

@@ -19,11 +19,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.analysis import ANALYSES
-from piezo_sim.experiment.cases import Case, read_experiment
+from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.on_nodes.conductor import RunFailed
-from piezo_sim.experiment.on_nodes.processes import NodeDied
-from piezo_sim.experiment.on_nodes.runner import Interrupted, Run, run_cases
 from piezo_sim.experiment.report import Section, print_table, write_html
 
 EXPERIMENTS = {
@@ -52,7 +49,7 @@ def main() -> int:
     except (ParameterError, FileExistsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return UNUSABLE
-    except (NodeDied, RunFailed, Interrupted, BagError) as error:
+    except (RunFailed, BagError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return FAILED
     console.print(f"report: {out / 'report.html'}", soft_wrap=True)
@@ -86,10 +83,15 @@ def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -
     print_tables(console, sections)
 
 
-def run_all(cases: Sequence[Case], out: Path, namespace: str, progress: Progress) -> Iterator[Run]:
+def run_all(
+    cases: Sequence[Case], out: Path, namespace: str, progress: Progress
+) -> Iterator[CaseRun]:
     """Run the cases on node processes, and those meant for it on the engine."""
     on_nodes = [case for case in cases if not case.engine]
     if on_nodes:
+        # Imported here: only nodes need ROS.
+        from piezo_sim.experiment.on_nodes.runner import run_cases
+
         yield from run_cases(on_nodes, out, namespace, progress)
     for case in cases:
         if case.engine:

@@ -10,11 +10,10 @@ from rich.progress import Progress
 
 from piezo_control.recording.writer import write_recording
 from piezo_sim import engine
-from piezo_sim.experiment.cases import Case
-from piezo_sim.experiment.on_nodes.runner import Run
+from piezo_sim.experiment.cases import Case, CaseRun
 
 
-def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> Run:
+def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> CaseRun:
     """Run one case; its bag goes to `out`/bags."""
     bag = out / "bags" / case.name
     task = progress.add_task(f"{case.name} (engine)", total=case.samples)
@@ -34,4 +33,4 @@ def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> Run
     bag.parent.mkdir(parents=True, exist_ok=True)
     write_recording(bag, finger, made, case.reference, case.tip_force)
     progress.update(task, completed=case.samples)
-    return Run(case, bag, case.samples / seconds, processes=1)
+    return CaseRun(case, bag, case.samples / seconds, processes=1)

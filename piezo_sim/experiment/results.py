@@ -14,7 +14,7 @@ import numpy as np
 from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import QUANTITIES, Figures, analyse
-from piezo_sim.experiment.on_nodes.runner import Run
+from piezo_sim.experiment.cases import CaseRun
 from piezo_sim.experiment.report import Section, cell
 
 MODE_TITLES = {
@@ -51,7 +51,7 @@ CLOSED_LOOP_AXIS = 0.045  # s: time axis of Fig. 13
 class Result:
     """A case that was run, its recording as read from the bag, and its figures."""
 
-    run: Run
+    run: CaseRun
     recording: Recording
     figures: Figures
 
@@ -72,7 +72,7 @@ class Result:
         return f"{degc[0]:g} °C" if np.ptp(degc) == 0 else "deflection"
 
 
-def result(run: Run) -> Result:
+def result(run: CaseRun) -> Result:
     """Read and analyse the bag of a run; raise BagError naming the bag."""
     recording = read(run.bag)
     try:

@@ -21,13 +21,10 @@ from piezo_control.parameters import declarations, flatten
 from piezo_control.profile import Profile
 from piezo_gripper_msgs.msg import FingerState, RecorderState
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
+from piezo_sim.experiment.cases import RunFailed
 
 SERVICE_TIMEOUT = 20.0  # s
 SERVICE_RETRY = 1.0  # s
-
-
-class RunFailed(RuntimeError):
-    """A run did not reach its end; the message names the node and what it said."""
 
 
 class Conductor:

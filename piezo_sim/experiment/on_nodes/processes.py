@@ -12,13 +12,15 @@ from pathlib import Path
 
 from ament_index_python.packages import get_package_prefix
 
+from piezo_sim.experiment.cases import RunFailed
+
 PACKAGE = "piezo_gripper"
 GRACE = 5.0  # s that a node has to stop after SIGTERM
 LOG_TAIL = 5  # lines of a dead node's log shown in the error
 PR_SET_PDEATHSIG = 1
 
 
-class NodeDied(RuntimeError):
+class NodeDied(RunFailed):
     """A node process ended although the experiment still needs it."""
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import rclpy
@@ -14,31 +13,21 @@ from rich.progress import Progress
 
 from piezo_control.nodes import spin
 from piezo_gripper_msgs.msg import FingerState
-from piezo_sim.experiment.cases import NODES, Case, params_folder
-from piezo_sim.experiment.on_nodes.conductor import Conductor, RunFailed
+from piezo_sim.experiment.cases import NODES, Case, CaseRun, RunFailed, params_folder
+from piezo_sim.experiment.on_nodes.conductor import Conductor
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 STALL = 30.0  # s without a new sample after which a run is given up
 DRAIN = 10.0  # s that the recorder may need to write the rest
 
 
-class Interrupted(RuntimeError):
+class Interrupted(RunFailed):
     """SIGINT or SIGTERM came while an experiment ran."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """A case that ran: its bag, and how fast and by how many processes."""
-
-    case: Case
-    bag: Path
-    steps_per_second: float
-    processes: int
 
 
 def run_cases(
     cases: Iterable[Case], out: Path, namespace: str, progress: Progress
-) -> Iterator[Run]:
+) -> Iterator[CaseRun]:
     """Run `cases` one after the other on the same node processes; bags go to `out`/bags.
 
     Raises NodeDied when a node process ends, RunFailed when a run does not, Interrupted on SIGINT and
@@ -76,7 +65,7 @@ def run_cases(
 
 def run_case(
     case: Case, conductor: Conductor, bag: Path, processes: int, progress: Progress
-) -> Run:
+) -> CaseRun:
     """Run one case on the conducted nodes, from configuring them to the closed bag."""
     task = progress.add_task(case.name, total=case.samples)
     conductor.configure(case.parameters(bag))
@@ -95,7 +84,7 @@ def run_case(
     )
     conductor.deactivate(reversed(NODES))
     progress.update(task, completed=case.samples)
-    return Run(case, bag, (finger.samples - first) / seconds, processes)
+    return CaseRun(case, bag, (finger.samples - first) / seconds, processes)
 
 
 def wait_for_phase(
