@@ -15,7 +15,7 @@ def shared(paths):
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Closed-loop control of a piezoelectric gripper finger over ROS 2 topics",
     author="piezo_gripper developers",
     maintainer="piezo_gripper developers",
@@ -28,8 +28,23 @@ setup(
         *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py"), *glob("msg_defs/msg/*.msg")]),
     ],
     python_requires=">=3.10",
-    install_requires=["setuptools"],
-    extras_require={"test": ["pytest", "hypothesis"]},
+    install_requires=[
+        "control",
+        "jinja2",
+        "matplotlib",
+        "mcap",  # no rosdep key: without it all works but the reading of MCAP bags
+        "numpy",
+        "pyyaml",
+        "rich",
+        "rosbags",
+        "scipy",
+        "setuptools",
+    ],
+    extras_require={
+        "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
+        "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
+        "test": ["coverage", "hypothesis", "mypy", "pytest", "ruff", "types-PyYAML"],
+    },
     zip_safe=True,
     entry_points={
         "console_scripts": [

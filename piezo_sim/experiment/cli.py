@@ -127,6 +127,7 @@ def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def print_tables(console: Console, sections: Sequence[Section]) -> None:
+    """Print the table of each section."""
     for section in sections:
         print_table(console, section)
 
