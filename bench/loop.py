@@ -32,12 +32,6 @@ ROUNDS = 3
 SECONDS = 3.0  # of one measurement
 WARM_UP = 0.5  # s at full rate before it
 LOOP = ("temperature", "feedforward", "feedback", "cantilever")
-PARAMS = {
-    "temperature": "temperature.yaml",
-    "feedforward": "feedforward.yaml",
-    "feedback": "feedback_paper.yaml",
-    "cantilever": "cantilever.yaml",
-}
 RATES_HZ = (20, 50, 100, 200, 500, 1000, 2000, 5000)
 STEADY = 0.999  # share of the periods
 TOLERANCE = 0.1  # of the sample time
@@ -98,16 +92,11 @@ def observer() -> Iterator[Observer]:
 def arguments(name: str, finger: str, **parameters: Any) -> list[str]:
     """Return the command-line arguments of node `name` in namespace `finger`."""
     words = ["--ros-args", "-r", f"__ns:=/{finger}"]
-    if name in PARAMS:
-        words += arguments_file(PARAMS[name])
+    if name in ("feedback", "finger"):
+        words += ["--params-file", str(params_folder() / "feedback_paper.yaml")]
     for key, value in parameters.items():
         words += ["-p", f"{key}:={value}"]
     return words
-
-
-def arguments_file(file: str) -> list[str]:
-    """Return the arguments that load a shipped parameter file."""
-    return ["--params-file", str(params_folder() / file)]
 
 
 def finger(name: str, log: Path, **parameters: Any) -> NodeProcesses:
@@ -154,8 +143,7 @@ def lockstep(log: Path) -> list[dict[str, Any]]:
         with observer() as watching, default_executor("finger"):
             default.append(watching.rate("finger"))
         bare.append(ring(3, SECONDS))
-        files = [word for file in PARAMS.values() for word in arguments_file(file)]
-        one = {"finger": [*arguments("finger", "finger"), *files]}
+        one = {"finger": arguments("finger", "finger")}
         with observer() as watching, NodeProcesses(one, log):
             composed.append(watching.rate("finger"))
     value = statistics.median(ours)

@@ -18,13 +18,14 @@ ARGUMENTS = {
 
 def generate_launch_description() -> LaunchDescription:
     params = PathJoinSubstitution([FindPackageShare("piezo_gripper"), "params"])
+    controller = LaunchConfiguration("controller")
     common = {"mode": LaunchConfiguration("mode")}
     sampled = {**common, "sample_time": LaunchConfiguration("sample_time")}
     nodes = {
-        "temperature": (["temperature.yaml"], common),
-        "feedforward": (["feedforward.yaml"], sampled),
-        "feedback": (["feedback_", LaunchConfiguration("controller"), ".yaml"], common),
-        "cantilever": (["cantilever.yaml"], {**sampled, "temperature_lockstep": True}),
+        "temperature": [common],
+        "feedforward": [sampled],
+        "feedback": [ParameterFile([params, "/feedback_", controller, ".yaml"]), common],
+        "cantilever": [{**sampled, "temperature_lockstep": True}],
     }
     return LaunchDescription(
         [
@@ -37,10 +38,10 @@ def generate_launch_description() -> LaunchDescription:
                     package="piezo_gripper",
                     executable=name,
                     namespace=LaunchConfiguration("namespace"),
-                    parameters=[ParameterFile([params, "/", *file]), changes],
+                    parameters=parameters,
                     output="screen",
                 )
-                for name, (file, changes) in nodes.items()
+                for name, parameters in nodes.items()
             ),
         ]
     )

@@ -2,7 +2,6 @@
 """The composed plant: against an independent integration, and against the paper's figures."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +9,12 @@ from scipy.integrate import solve_ivp
 
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.hysteresis import Hysteresis
-from piezo_control.parameters import build, load
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 from piezo_sim.plant.contact import ContactParameters
 from piezo_sim.plant.creep import CreepParameters
 from piezo_sim.plant.sensor import SensorParameters
 from piezo_sim.plant.thermal import ThermalParameters
 
-PARAMS = Path(__file__).parent.parent / "params"
 PERFECT = SensorParameters(resolution=0.0, noise=0.0, delay_samples=0)
 
 
@@ -165,8 +162,3 @@ def test_reset_repeats_a_run_and_another_seed_does_not():
     assert (run(cantilever, voltages, 22.0) == first).all()
     other = Cantilever(dataclasses.replace(NOISY, seed=2))
     assert (run(other, voltages, 22.0) != first).any()
-
-
-def test_parameter_file_holds_the_defaults():
-    values = load(PARAMS / "cantilever.yaml", "cantilever")
-    assert build(CantileverParameters, values) == CantileverParameters()

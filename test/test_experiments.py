@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+import yaml
 from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
@@ -316,6 +317,18 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
         assert run_cli(monkeypatch, "step", "--engine", "--out", out, *words) == 2
         assert message in capsys.readouterr().err
         assert not out.exists()
+
+
+def test_own_parameters_apply_the_voltage_that_was_asked_for(tmp_path):
+    """A file with another static gain changes what a command means, not the voltage of an experiment."""
+    own = {"/**/feedforward": {"ros__parameters": {"static_gain": 1.1e-6}}}
+    (tmp_path / "feedforward.yaml").write_text(yaml.safe_dump(own))
+    title, (case, *_) = read_experiment("hysteresis", {"params": tmp_path})
+    made = run_on_engine(
+        dataclasses.replace(case, engine=True), tmp_path, "finger", Progress(disable=True)
+    )
+    voltage = read(made.bag).voltage
+    assert (voltage.min(), voltage.max()) == pytest.approx((-40.0, 40.0), abs=1e-3)
 
 
 def test_profile_names_what_is_wrong():

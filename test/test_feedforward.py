@@ -2,7 +2,6 @@
 """The feedforward law in front of the very operator it inverts, with and without limits."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import Hysteresis, HysteresisParameters
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError, build
 
 SAMPLE_TIME = 1e-4
 ASYMMETRIC = HysteresisParameters(
@@ -94,12 +93,6 @@ def test_commands_that_are_no_number_change_nothing(command):
     with pytest.raises(ValueError, match="command is"):
         law.step(command)
     assert law.snapshot() == before
-
-
-def test_shipped_parameters_are_the_defaults():
-    shipped = Path(__file__).parents[1] / "params" / "feedforward.yaml"
-    values = load(shipped, "feedforward")
-    assert build(FeedforwardParameters, values, str(shipped)) == FeedforwardParameters()
 
 
 def test_refusal_names_file_and_index():

@@ -153,8 +153,7 @@ class Bench:
         object_file.write_text(
             yaml.safe_dump({"/**/cantilever": {"ros__parameters": {"contact": contact}}})
         )
-        files = [params_folder() / f"{n}.yaml" for n in ("cantilever", "feedforward")]
-        files += [params_folder() / "feedback_paper.yaml", object_file]
+        files = [params_folder() / "feedback_paper.yaml", object_file]
         self.log = folder / "gripper.log"
         self.processes = {}
         for side in SIDES:

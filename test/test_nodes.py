@@ -175,7 +175,7 @@ def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp
 
 
 def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tmp_path):
-    with node("cantilever", tmp_path, "cantilever.yaml", reply_timeout=0.5):
+    with node("cantilever", tmp_path, reply_timeout=0.5):
         deflections = neighbour.listen(Sample, "deflection")
         states = neighbour.listen(FingerState, "state", LATCHED)
         neighbour.node.create_publisher(Sample, "command", SAMPLE)
@@ -198,7 +198,7 @@ def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tm
 
 
 def test_cantilever_names_the_missing_node(neighbour, tmp_path):
-    with node("cantilever", tmp_path, "cantilever.yaml"):
+    with node("cantilever", tmp_path):
         states = neighbour.listen(FingerState, "state", LATCHED)
         neighbour.wait(lambda: states and "node 'feedback' is gone" in states[-1].text)
         neighbour.node.create_publisher(Sample, "command", SAMPLE)
@@ -206,7 +206,7 @@ def test_cantilever_names_the_missing_node(neighbour, tmp_path):
 
 
 def test_cantilever_refuses_a_voltage_that_is_no_number(neighbour, tmp_path):
-    with node("cantilever", tmp_path, "cantilever.yaml"):
+    with node("cantilever", tmp_path):
         states = neighbour.listen(FingerState, "state", LATCHED)
         deflections = neighbour.listen(Sample, "deflection")
         voltage = neighbour.publisher("voltage")
@@ -221,7 +221,7 @@ def test_cantilever_refuses_a_voltage_that_is_no_number(neighbour, tmp_path):
 def test_feedforward_answers_with_the_law(neighbour, tmp_path):
     law = Feedforward(FeedforwardParameters(), sample_time=1e-4)
     commands = [0.0, 3e-6, 12e-6, 5e-6, 30e-6]
-    with node("feedforward", tmp_path, "feedforward.yaml"):
+    with node("feedforward", tmp_path):
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
         neighbour.insist(command, sample(0, commands[0]), lambda: voltages)
@@ -237,7 +237,7 @@ def test_feedforward_answers_with_the_law(neighbour, tmp_path):
 def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     slew = 1e3  # V/s, so 20 V take 20 ms
     parameters = {"mode": "free_running", "ramp": slew, "hold_time": 0.2}
-    with node("feedforward", tmp_path, "feedforward.yaml", **parameters) as processes:
+    with node("feedforward", tmp_path, **parameters) as processes:
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
         neighbour.insist(command, sample(0, 8e-6), lambda: voltages)
@@ -253,7 +253,7 @@ def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
 
 def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
     parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
-    with node("cantilever", tmp_path, "cantilever.yaml", **parameters):
+    with node("cantilever", tmp_path, **parameters):
         states = neighbour.listen(FingerState, "state", LATCHED)
         deflections = neighbour.listen(Sample, "deflection")
         voltage = neighbour.publisher("voltage")
@@ -267,7 +267,7 @@ def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
 
 
 def test_parameters_are_described_and_refused_with_their_range(neighbour, tmp_path):
-    with node("cantilever", tmp_path, "cantilever.yaml", autostart=False):
+    with node("cantilever", tmp_path, autostart=False):
         request = DescribeParameters.Request(names=["sensor.resolution"])
         (described,) = neighbour.ask(
             DescribeParameters, "cantilever/describe_parameters", request
@@ -288,7 +288,7 @@ def test_parameters_are_described_and_refused_with_their_range(neighbour, tmp_pa
 
 
 def test_active_cantilever_refuses_what_needs_a_new_run(neighbour, tmp_path):
-    with node("cantilever", tmp_path, "cantilever.yaml"):
+    with node("cantilever", tmp_path):
         neighbour.publisher("voltage")
         answer = neighbour.set("cantilever", samples=7)
         assert (answer.successful, answer.reason) == (

@@ -19,8 +19,8 @@ from piezo_sim.temperature import TemperatureParameters
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"
 ROBUST = build(FeedbackParameters, load(PARAMS / "feedback_robust.yaml", "feedback"))
-FEEDFORWARD = build(FeedforwardParameters, load(PARAMS / "feedforward.yaml", "feedforward"))
-NOMINAL = build(CantileverParameters, load(PARAMS / "cantilever.yaml", "cantilever"))
+FEEDFORWARD = FeedforwardParameters()
+NOMINAL = CantileverParameters()
 STEP_AT = 50
 BOX = list(itertools.product((0.9, 1.0, 1.1), (0.5, 2.0), (0.9, 1.0, 1.1)))
 

@@ -3,7 +3,6 @@
 
 import math
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +12,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.integrate import solve_ivp
 
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError
 from piezo_sim.temperature import PROFILES, TemperatureParameters, grid_index, temperature
-
-PARAMS = Path(__file__).parent.parent / "params"
 
 
 def values(count=20000, first=0, **changes):
@@ -165,8 +162,3 @@ def test_parameters_that_do_not_fit_are_refused():
         TemperatureParameters(profile="spotlight", on_time=11.0)
     with pytest.raises(ParameterError, match="'file' is empty"):
         TemperatureParameters(profile="replay")
-
-
-def test_parameter_file_holds_the_defaults():
-    read = build(TemperatureParameters, load(PARAMS / "temperature.yaml", "temperature"))
-    assert read == TemperatureParameters()

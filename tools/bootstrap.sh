@@ -87,9 +87,10 @@ build_packages() {
     cmake_args+=(-DCMAKE_PROJECT_INCLUDE="$root/tools/wheel_includes.cmake")
   fi
   mkdir -p log
+  [ ! -d build ] || find build -xtype l -delete  # links to files that are gone
   python -m colcon build --base-paths . msg_defs --symlink-install --cmake-args "${cmake_args[@]}" \
     > log/build.log 2>&1 || { cat log/build.log >&2; fail "the build failed (its output is above)"; }
-  find install/piezo_gripper -xtype l -delete  # links to files that are gone
+  find install/piezo_gripper -xtype l -delete
 }
 
 fingerprint() { sha256sum | cut -d ' ' -f 1; }

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from piezo_control.feedforward import Feedforward
 from piezo_control.identification.excitation import decaying_sine
 from piezo_control.nodes.feedback import FeedbackNodeParameters
 from piezo_control.nodes.feedforward import FeedforwardNodeParameters
@@ -48,7 +49,9 @@ UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
 class Case:
     """One run of one finger. Times in s; reference in m, tip force in N.
 
-    Parameter files in the folder `params` take the place of the shipped ones of the same name. `analysis` names the analysis of its recording; on the `engine`, every `every`-th sample is recorded.
+    Parameter files in the folder `params`, named after their node or controller, take the place of the
+    defaults and of the shipped controllers. `analysis` names the analysis of its recording; on the
+    `engine`, every `every`-th sample is recorded.
     """
 
     name: str
@@ -98,16 +101,21 @@ class Case:
                 "clock_period": 10 * grid,
             },
         }
-        files = {n: self._file(n) for n in ("feedforward", "temperature", "cantilever")}
+        given = {n: own_parameters(self.params, n) for n in NODES}
         if self.mode == "feedback":
-            files["feedback"] = self._file(f"feedback_{self.controller}")
-        else:
-            changes["feedback"]["sample_time"] = self.sample_time
-        parameters = {}
-        for name, kind in NODES.items():
-            values = load(files[name], name) if name in files else {}
+            file = f"feedback_{self.controller}.yaml"
+            own = self.params / file if self.params else None
+            shipped = params_folder() / file
+            given["feedback"] = load(own if own and own.exists() else shipped, "feedback")
+        parameters: dict[str, Any] = {}
+        for name, kind in NODES.items():  # the feedforward first: it knows what can be reached
+            if name == "feedback" and self.mode != "feedback":
+                reach = Feedforward(parameters["feedforward"], self.sample_time).reachable_range
+                changes[name].update(
+                    sample_time=self.sample_time, command_low=reach[0], command_high=reach[1]
+                )
             parameters[name] = build(
-                kind, {**values, **changes[name]}, f"case '{self.name}': {name}"
+                kind, {**given[name], **changes[name]}, f"case '{self.name}': {name}"
             )
         if parameters["feedback"].sample_time != self.sample_time:
             raise ParameterError(
@@ -116,9 +124,14 @@ class Case:
             )
         return parameters
 
-    def _file(self, name: str) -> Path:
-        own = self.params / f"{name}.yaml" if self.params else None
-        return own if own and own.exists() else params_folder() / f"{name}.yaml"
+
+def own_parameters(folder: Path | None, node: str) -> dict[str, Any]:
+    """Return what `folder`/NODE.yaml gives to a node; nothing where there is none.
+
+    The finger of the paper needs no file: it is the default of every parameter.
+    """
+    path = folder / f"{node}.yaml" if folder else None
+    return load(path, node) if path and path.exists() else {}
 
 
 class RunFailed(RuntimeError):
@@ -250,8 +263,10 @@ def _reference(run: Mapping[str, Any], where: str) -> Profile:
     if run["mode"] != "open_loop":
         raise ParameterError(f"{where}: 'voltage' needs mode: open_loop, it is {run['mode']}")
     voltage = profile(run["voltage"], "v", where)
-    values = load(params_folder() / "feedforward.yaml", "feedforward")
-    return Profile(voltage.time, voltage.value * values["static_gain"], voltage.linear)
+    # The node divides by the gain of its own file, so the voltage is converted with that one.
+    values = own_parameters(run.get("params"), "feedforward")
+    gain = build(FeedforwardNodeParameters, values, where).static_gain
+    return Profile(voltage.time, voltage.value * gain, voltage.linear)
 
 
 def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
