@@ -27,10 +27,11 @@ from piezo_control.hysteresis import (
     remember_voltage,
 )
 from piezo_control.parameters import group, parameter
+from piezo_control.safety import VoltageParameters, limited
 
 
 @dataclass(frozen=True)
-class FeedforwardParameters:
+class FeedforwardParameters(VoltageParameters):
     """Compensator, hysteresis and voltage limits of one finger."""
 
     compensator: str = parameter(
@@ -41,8 +42,6 @@ class FeedforwardParameters:
     static_gain: float = parameter(
         22.0e-6 / 40.0, "deflection per volt, end to end of the loop", unit="m/V", low=1e-12
     )
-    voltage_limit: float = parameter(40.0, "largest voltage, either sign", unit="V", low=0.0)
-    slew_limit: float = parameter(1.0e6, "largest rate of the voltage", unit="V/s", low=1e-3)
     hysteresis: HysteresisParameters = group(HysteresisParameters)
 
 
@@ -51,7 +50,8 @@ class FeedforwardCoefficients(NamedTuple):
 
     inverting: bool
     static_gain: float
-    voltage_limit: float
+    low: float  # V
+    high: float  # V
     step_limit: float  # V per sample
     operator: Coefficients
     inverse: Coefficients
@@ -64,16 +64,19 @@ class FeedforwardState(NamedTuple):
     clipped: Sequence[float]  # one number: samples at which a limit acted
 
 
-def feedforward_step(c: FeedforwardCoefficients, s: FeedforwardState, command: float) -> float:
-    """Return the voltage (V) for the commanded deflection (m) of this sample."""
+def feedforward_step(
+    c: FeedforwardCoefficients, s: FeedforwardState, command: float, share: float
+) -> float:
+    """Return the voltage (V) for the commanded deflection (m) of this sample.
+
+    `share` is the part of a sample time that has passed since the last one: 1 in a loop that keeps time,
+    less where samples come in a burst, so that the slew limit holds in time.
+    """
     if c.inverting:
         wanted = inverse_voltage(c.inverse, s.hysteresis, command)
     else:
         wanted = command / c.static_gain
-    last = s.hysteresis.drive[0]
-    low = max(-c.voltage_limit, last - c.step_limit)
-    high = min(c.voltage_limit, last + c.step_limit)
-    voltage = min(high, max(low, wanted))
+    voltage = limited(c.low, c.high, c.step_limit * share, s.hysteresis.drive[0], wanted)
     if voltage != wanted:
         s.clipped[0] += 1.0
     if not c.inverting:
@@ -85,15 +88,10 @@ def feedforward_step(c: FeedforwardCoefficients, s: FeedforwardState, command: f
     return voltage
 
 
-def toward_zero(voltage: float, step: float) -> float:
-    """Return `voltage` (V) one `step` (V) closer to 0 V, or 0 V: one sample of a safe ramp."""
-    return math.copysign(max(abs(voltage) - step, 0.0), voltage)
-
-
 class Feedforward:
-    """Feedforward law of one finger at a fixed `sample_time` (s), starting at 0 V and homed.
+    """Feedforward law of one finger at a fixed `sample_time` (s), starting at rest and homed.
 
-    >>> law = Feedforward(FeedforwardParameters(), sample_time=1e-4)
+    >>> law = Feedforward(FeedforwardParameters(slew_limit=1e6), sample_time=1e-4)
     >>> round(law.step(22e-6), 9)
     40.0
     """
@@ -101,22 +99,28 @@ class Feedforward:
     def __init__(self, parameters: FeedforwardParameters, sample_time: float) -> None:
         operator = coefficients(parameters.hysteresis, sample_time)
         self.coefficients = FeedforwardCoefficients(
-            parameters.compensator == "inverse",
-            parameters.static_gain,
-            parameters.voltage_limit,
-            parameters.slew_limit * sample_time,
-            operator,
-            invert(operator),
+            inverting=parameters.compensator == "inverse",
+            static_gain=parameters.static_gain,
+            low=parameters.voltage_low,
+            high=parameters.voltage_high,
+            step_limit=parameters.slew_limit * sample_time,
+            operator=operator,
+            inverse=invert(operator),
         )
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: 0 V, every play at 0 (a homed finger), no clipped sample."""
+        """Forget everything: a homed finger at the voltage nearest to 0 V, no clipped sample."""
         plays = [0.0] * len(self.coefficients.operator.weights)
         self.state = FeedforwardState(State(plays, [0.0, 0.0]), [0.0])
+        rest = min(max(0.0, self.coefficients.low), self.coefficients.high)
+        if rest:
+            self.follow(rest)
 
-    def step(self, command: float) -> float:
+    def step(self, command: float, share: float = 1.0) -> float:
         """Return the voltage (V) for the commanded deflection (m) of this sample.
+
+        `share` (0 to 1) is the part of a sample time that has passed since the last one.
 
         Raises
         ------
@@ -125,12 +129,17 @@ class Feedforward:
         """
         if not math.isfinite(command):
             raise ValueError(f"command is {command!r}, must be a finite deflection in m")
-        return feedforward_step(self.coefficients, self.state, command)
+        return feedforward_step(self.coefficients, self.state, command, share)
 
     def follow(self, voltage: float) -> None:
-        """Take note of a `voltage` (V) applied by somebody else: a ramp to 0 V, a homing sweep."""
+        """Take note of a `voltage` (V) applied by somebody else: a ramp to rest, a homing sweep."""
         c = self.coefficients
         inverse_follow(c.operator, c.inverse, self.state.hysteresis, voltage)
+
+    @property
+    def voltage(self) -> float:
+        """The last voltage (V)."""
+        return self.state.hysteresis.drive[0]
 
     @property
     def clipped(self) -> int:
@@ -139,21 +148,8 @@ class Feedforward:
 
     @property
     def reachable_range(self) -> tuple[float, float]:
-        """Lowest and highest deflection (m) within the voltage limit, from the homed state."""
+        """Lowest and highest deflection (m) within the voltage limits, from the homed state."""
         c = self.coefficients
         if not c.inverting:
-            high = c.static_gain * c.voltage_limit
-            return -high, high
-        return reachable_range(c.operator, c.voltage_limit)
-
-    def snapshot(self) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
-        """Return a copy of the state, for :meth:`restore`."""
-        hysteresis, clipped = self.state
-        return tuple(hysteresis.plays), tuple(hysteresis.drive), tuple(clipped)
-
-    def restore(
-        self, snapshot: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
-    ) -> None:
-        """Go back to the state of a snapshot."""
-        plays, drive, clipped = snapshot
-        self.state = FeedforwardState(State(list(plays), list(drive)), list(clipped))
+            return c.static_gain * c.low, c.static_gain * c.high
+        return reachable_range(c.operator, c.low, c.high)

@@ -30,6 +30,7 @@ Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -285,16 +286,20 @@ def inverse_follow(operator: Coefficients, inverse: Coefficients, s: State, volt
     remember_voltage(s, voltage)
 
 
-def reachable_range(operator: Coefficients, voltage_limit: float) -> tuple[float, float]:
-    """Return the lowest and highest deflection (m) a homed actuator reaches within +-limit (V).
+def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[float, float]:
+    """Return the deflections (m) at which a homed actuator arrives with `low` and `high` (V).
 
-    Beyond it the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
+    Beyond them the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
     """
-    hysteresis = sum(
-        weight * max(voltage_limit - threshold, 0.0)
-        for weight, threshold in zip(operator.weights, operator.thresholds, strict=True)
-    )
-    return dead_zones(operator, -hysteresis), dead_zones(operator, hysteresis)
+
+    def arrive(voltage: float) -> float:
+        hysteresis = sum(
+            weight * max(abs(voltage) - threshold, 0.0)
+            for weight, threshold in zip(operator.weights, operator.thresholds, strict=True)
+        )
+        return dead_zones(operator, math.copysign(hysteresis, voltage))
+
+    return arrive(low), arrive(high)
 
 
 def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:
@@ -407,56 +412,6 @@ class InverseHysteresis(_Memory):
         actuator = self.snapshot()
         map_plays(self.coefficients, actuator)
         return actuator.plays
-
-
-class HysteresisBatch:
-    """Operators of many actuators at once, on arrays with one entry per actuator.
-
-    Parameters
-    ----------
-    parameters : sequence of HysteresisParameters
-        One per actuator, all with equally many plays and dead zones; each starts homed.
-    sample_time : float
-        Time between steps (s).
-    inverse : bool
-        Compute voltages from deflections instead.
-    """
-
-    def __init__(
-        self,
-        parameters: Sequence[HysteresisParameters],
-        sample_time: float = 1.0,
-        inverse: bool = False,
-    ) -> None:
-        each = [coefficients(p, sample_time) for p in parameters]
-        if inverse:
-            each = [invert(c) for c in each]
-        self._inverse = inverse
-        self._c = Coefficients(*(np.array(entry) for entry in zip(*each, strict=True)))
-        self._growing = np.arange(self._c.weights.shape[1]) > 0
-        self.plays = np.zeros_like(self._c.weights)
-        self._voltage = np.zeros(len(each))
-        self._voltage_step = np.zeros(len(each))
-
-    def step(self, value: ArrayLike) -> NDArray[np.float64]:
-        """Take one voltage (V) per actuator and return the deflections (m); inverse: m to V."""
-        value = np.asarray(value, float)
-        drive = _dead_zones_of(self._c, value) if self._inverse else value
-        growth = (self._c.dilation * self._voltage_step)[:, None] * self._growing
-        threshold = self._c.thresholds + growth
-        drive = drive[:, None]
-        self.plays = np.minimum(drive + threshold, np.maximum(drive - threshold, self.plays))
-        total = np.sum(self._c.weights * self.plays, axis=1)
-        result, voltage = (
-            (total, total) if self._inverse else (_dead_zones_of(self._c, total), value)
-        )
-        self._voltage_step = np.abs(voltage - self._voltage)
-        self._voltage = voltage
-        return result
-
-    def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Apply a history, shape (samples, actuators); return one of equal shape."""
-        return np.array([self.step(value) for value in np.asarray(values, float)])
 
 
 def _dead_zones_of(c: Coefficients, value: NDArray) -> NDArray:

@@ -176,14 +176,14 @@ def _dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def dump(path: str | Path, node: str, parameters: Any, comment: str = "") -> None:
-    """Write `parameters` (a parameter dataclass instance) as a ROS parameter file for `node`.
+def dump(path: str | Path, node: str, values: Mapping[str, Any], comment: str = "") -> None:
+    """Write ``{dotted name: value}`` as a ROS parameter file for `node`.
 
     `comment` goes on top, each line behind a '#'. Empty arrays are left out: ROS cannot type them.
     """
     tree: dict[str, Any] = {}
-    for name, value in flatten(parameters).items():
-        if isinstance(value, tuple):
+    for name, value in values.items():
+        if isinstance(value, (tuple, list)):
             if not value:
                 continue
             value = list(value)

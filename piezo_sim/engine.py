@@ -12,21 +12,15 @@ as Python, slowly.
 from __future__ import annotations
 
 import copy
-import functools
-import hashlib
-import importlib.util
-import inspect
-import os
-import warnings
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from piezo_control import dynamics, hysteresis
 from piezo_control import feedback as feedback_law
 from piezo_control import feedforward as feedforward_law
+from piezo_control.compiled import compiled as compile_loop
+from piezo_control.compiled import has_numba
 from piezo_control.feedback import (
     FeedbackCoefficients,
     FeedbackParameters,
@@ -42,16 +36,9 @@ from piezo_control.feedforward import (
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording
+from piezo_control.safety import VoltageParameters
 from piezo_sim.plant import (
-    amplifier,
     cantilever,
-    contact,
-    creep,
-    sensor,
-    thermal,
-)
-from piezo_sim.plant import (
-    bouc_wen as truth,
 )
 from piezo_sim.plant.cantilever import (
     CantileverModel,
@@ -150,7 +137,8 @@ def run(
     degc = temperature(temperatures, 0, int(index[-1]) + 1)[index]
     finger = finger_at_rest(plant, feedforward, feedback, float(degc[0]))
     outputs = Outputs(*np.empty((len(Outputs._fields), -(-samples // every))))
-    loop = compiled_loop() if compiled or compiled is None and has_numba() else run_samples
+    fast = has_numba() if compiled is None else compiled
+    loop = compile_loop(run_samples) if fast else run_samples
     noise, dropouts = cantilever.generators(plant.seed)
     for first in range(0, samples, AT_ONCE):
         last = min(first + AT_ONCE, samples)
@@ -187,11 +175,11 @@ def drive(
     every: int = 1,
 ) -> Run:
     """Apply a `voltage` profile (V) to the bare cantilever; reference and command are that voltage."""
-    limit = plant.amplifier.voltage_limit
-    straight = FeedforwardParameters(
-        compensator="static_gain", static_gain=1.0, voltage_limit=limit, slew_limit=np.inf
+    limits = {f.name: getattr(plant.amplifier, f.name) for f in fields(VoltageParameters)}
+    straight = FeedforwardParameters(compensator="static_gain", static_gain=1.0, **limits)
+    open_loop = FeedbackParameters(
+        command_low=limits["voltage_low"], command_high=limits["voltage_high"]
     )
-    open_loop = FeedbackParameters(command_low=-limit, command_high=limit)
     return run(plant, straight, open_loop, temperatures, voltage, samples, tip_force, every)
 
 
@@ -239,7 +227,7 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
         command = feedback_step(
             finger.feedback, finger.feedback_state, inputs.reference[n], deflection
         )
-        voltage = feedforward_step(finger.feedforward, finger.feedforward_state, command)
+        voltage = feedforward_step(finger.feedforward, finger.feedforward_state, command, 1.0)
         if (first + n) % every == 0:
             row = (first + n) // every
             outputs.deflection[row] = deflection
@@ -248,47 +236,3 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
-
-
-@functools.cache
-def has_numba() -> bool:
-    """Say whether the compiler is installed, without importing it."""
-    return importlib.util.find_spec("numba") is not None
-
-
-@functools.cache
-def compiled_loop() -> Any:
-    """Return `run_samples` compiled by numba; the machine code is kept for the next process.
-
-    numba notices a change of this file, not of the laws it calls, so the code is kept in a folder
-    named after the sources of all of them.
-    """
-    import numba
-    from numba.extending import register_jitable
-
-    laws = (
-        hysteresis, feedforward_law, feedback_law, amplifier, cantilever, contact, creep, dynamics,
-        sensor, thermal, truth,
-    )  # fmt: skip
-    for law in laws:
-        for kernel in vars(law).values():
-            if inspect.isfunction(kernel) and kernel.__module__ == law.__name__:
-                register_jitable(forceinline=True)(kernel)
-    sources = hashlib.sha256()
-    for law in laws:
-        sources.update(Path(law.__file__).read_bytes())
-    folder = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"), "piezo_gripper")
-    folder /= sources.hexdigest()[:16]
-    # Without reference counts (_nrt) an allocation in the loop would not even compile.
-    options = {"nogil": True, "error_model": "numpy", "_nrt": False}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        warnings.warn(f"compiled anew in every process: no room at {folder}: {error}", stacklevel=2)
-        return numba.njit(**options)(run_samples)
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(folder)
-    try:
-        return numba.njit(cache=True, **options)(run_samples)
-    finally:
-        numba.config.CACHE_DIR = before

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piezo_control.compiled import compiled
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError, build, load
@@ -126,7 +127,7 @@ def test_no_samples_are_refused():
 def test_one_machine_code_serves_every_finger():
     run()
     run(plant=CantileverParameters(plant="truth"), feedback=OPEN_LOOP)
-    assert len(engine.compiled_loop().signatures) == 1
+    assert len(compiled(engine.run_samples).signatures) == 1
 
 
 def test_importing_the_engine_does_not_import_the_compiler():

@@ -250,7 +250,8 @@ def test_grip_and_release_an_object(bench):
     # quantum of 10 nm and 5 nm of noise, and two fingers each in its own time may be 0.2 s apart.
     touching = 40e-6 - 2 * FREE_PLAY
     assert limit <= result.force
-    assert touching - 2 * result.force / STIFFNESS - 0.1e-6 < result.opening < touching
+    apart = 0.2 * speed / 2  # what the second finger may lack when the first one stops both
+    assert touching - 2 * result.force / STIFFNESS - 0.1e-6 < result.opening < touching + apart
     assert felt[0].force == 0.0 and felt[0].opening == pytest.approx(40e-6, abs=0.3e-6)
     held = bench.held()
     answer = bench.grip(36e-6)  # away from the object, although the force is at its limit

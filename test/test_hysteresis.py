@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from piezo_control.hysteresis import (
     Hysteresis,
-    HysteresisBatch,
     HysteresisParameters,
     coefficients,
     deflection_history,
@@ -91,7 +90,7 @@ def test_operator_after_inverse_is_the_identity(parameters, past, history):
     deflections = actuator(history)
     actuator.restore(reference)
     inverse = actuator.inverse()
-    span = np.ptp(reachable_range(actuator.coefficients, LIMIT)) + np.ptp(deflections)
+    span = np.ptp(reachable_range(actuator.coefficients, -LIMIT, LIMIT)) + np.ptp(deflections)
     voltages = inverse(deflections)
     np.testing.assert_allclose(voltages, history, rtol=0, atol=1e-12 * 2 * LIMIT)
     np.testing.assert_allclose(actuator(voltages), deflections, rtol=0, atol=1e-12 * span)
@@ -189,7 +188,7 @@ def test_reachable_range_is_reached_and_not_passed():
     parameters = HysteresisParameters(
         upper_thresholds=(5e-6,), upper_weights=(0.2,), lower_thresholds=(8e-6,), lower_weights=(-0.1,)
     )  # fmt: skip
-    low, high = reachable_range(coefficients(parameters, 1.0), LIMIT)
+    low, high = reachable_range(coefficients(parameters, 1.0), -LIMIT, LIMIT)
     assert high == pytest.approx(22e-6 + 0.2 * 17e-6, rel=1e-12)
     assert low == pytest.approx(-22e-6 + 0.1 * 14e-6, rel=1e-12)
     actuator = Hysteresis(parameters)
@@ -224,29 +223,11 @@ def test_errors_fade_in_the_inverse_of_a_rate_dependent_operator():
     assert abs(inverse(deflection) - undisturbed)[-1] < 1e-9
 
 
-def test_batch_equals_single_actuators():
-    rng = np.random.default_rng(3)
-    parameters = [
-        HysteresisParameters(
-            (0.0, *increasing(rng.uniform(0.5, 3.0, 5))),
-            tuple(rng.uniform(1e-8, 3e-7, 6).tolist()),
-            (2e-6, 4e-6),
-            tuple(rng.uniform(-0.2, 0.2, 2).tolist()),
-            (3e-6,),
-            (0.1,),
-            rate_coefficient=0.01,
-        )
-        for _ in range(7)
-    ]
-    voltage = rng.uniform(-40.0, 40.0, (200, 7))
-    deflection = HysteresisBatch(parameters, 0.1)(voltage)
-    for finger, p in enumerate(parameters):
-        single = Hysteresis(p, 0.1)(voltage[:, finger])
-        np.testing.assert_allclose(deflection[:, finger], single, rtol=0, atol=1e-18)
-        at_once = deflection_history(p, voltage[:, finger], 0.1)
-        np.testing.assert_allclose(at_once, single, rtol=0, atol=1e-18)
-    again = HysteresisBatch(parameters, 0.1, inverse=True)(deflection)
-    np.testing.assert_allclose(again, voltage, rtol=0, atol=80e-12)
+@given(hysteresis_parameters(dead_zones(), st.floats(0.0, 0.9)), histories)
+def test_history_at_once_equals_step_by_step(parameters, history):
+    single = Hysteresis(parameters, SAMPLE_TIME)(history)
+    at_once = deflection_history(parameters, np.asarray(history), SAMPLE_TIME)
+    np.testing.assert_allclose(at_once, single, rtol=1e-12, atol=1e-18)
 
 
 def test_play_history_with_changing_thresholds():

@@ -146,9 +146,10 @@ def test_feedforward_identified_from_a_plant_of_another_class():
     model = identify_hysteresis(measurement, equal_thresholds(measurement, 20), 3, lag=0.0)
 
     reference = 20e-6 * np.sin(2.0 * np.pi * np.arange(0.0, 3.0, sample_time))
-    inverse = FeedforwardParameters(hysteresis=model.parameters, voltage_limit=45.0)
+    stands = {"voltage_low": -45.0, "voltage_high": 45.0, "slew_limit": 1e6}
+    inverse = FeedforwardParameters(hysteresis=model.parameters, **stands)
     straight = FeedforwardParameters(
-        compensator="static_gain", static_gain=np.ptp(deflection) / 80.0, voltage_limit=45.0
+        compensator="static_gain", static_gain=np.ptp(deflection) / 80.0, **stands
     )
     assert tracked(Feedforward(inverse, sample_time)) <= 2.5
     assert tracked(Feedforward(straight, sample_time)) > 7.0

@@ -60,7 +60,10 @@ def test_excite_identify_linearise_a_plant_of_another_class(identify, tmp_path):
     peak = {}
     for name, feedforward in (
         ("inverse", identified),
-        ("static_gain", FeedforwardParameters("static_gain", identified.static_gain)),
+        (
+            "static_gain",
+            FeedforwardParameters(compensator="static_gain", static_gain=identified.static_gain),
+        ),
     ):
         result = run(plant, feedforward, FeedbackParameters(), CONSTANT, reference, 3000)
         error = np.abs(result.true_deflection - np.roll(result.reference, 1))

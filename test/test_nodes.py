@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Single nodes as a user meets them: the test plays the neighbours, over real topics."""
 
+import itertools
 import math
 import re
 import signal
@@ -240,15 +241,26 @@ def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     with node("feedforward", tmp_path, **parameters) as processes:
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
-        neighbour.insist(command, sample(0, 8e-6), lambda: voltages)
-        assert voltages[0].value > 10.0
+        numbers = itertools.count()
+        timer = neighbour.node.create_timer(
+            0.01, lambda: command.publish(sample(next(numbers), 8e-6))
+        )
+        neighbour.wait(lambda: voltages and voltages[-1].value > 10.0)
+        neighbour.node.destroy_timer(timer)
         if end == "deactivation":
             assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
         elif end != "silence":
             processes.running["feedforward"].send_signal(signal.Signals[end])
         neighbour.wait(lambda: voltages[-1].value == 0.0)
-    fall = [a.value - b.value for a, b in zip(voltages, voltages[1:])]
-    assert all(0 <= step <= slew * 1e-3 * (1 + 1e-9) for step in fall)
+    steps = [b.value - a.value for a, b in zip(voltages, voltages[1:])]
+    assert all(
+        abs(step) <= 4.0 * (1 + 1e-9) for step in steps
+    )  # the slew limit, 4e4 V/s, per 0.1 ms
+    fall = [-step for step in steps if step < 0]
+    assert all(step <= slew * 1e-3 * (1 + 1e-9) for step in fall)
+    values = [v.value for v in voltages]
+    after_the_top = values[values.index(max(values)) :]
+    assert after_the_top == sorted(after_the_top, reverse=True)
 
 
 def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
@@ -300,11 +312,11 @@ def test_active_cantilever_refuses_what_needs_a_new_run(neighbour, tmp_path):
 
 def test_bad_start_parameter_ends_with_one_line(tmp_path):
     result = subprocess.run(
-        [EXECUTABLES / "feedforward", "--ros-args", "-p", "voltage_limit:=-3.0"],
+        [EXECUTABLES / "feedforward", "--ros-args", "-p", "voltage_high:=-3000.0"],
         capture_output=True, text=True, timeout=TIMEOUT,
     )  # fmt: skip
     assert result.returncode == 2
-    assert "voltage_limit" in result.stderr and "-3.0" in result.stderr
+    assert "voltage_high" in result.stderr and "-3000.0" in result.stderr
     assert "Traceback" not in result.stderr
 
 

@@ -33,7 +33,7 @@ from piezo_control.design.certificate import Certificate, Row, certify  # noqa: 
 from piezo_control.design.problem import DesignProblem  # noqa: E402
 from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
 from piezo_control.feedback import FeedbackParameters  # noqa: E402
-from piezo_control.parameters import ParameterError, build, dump, load  # noqa: E402
+from piezo_control.parameters import ParameterError, build, dump, flatten, load  # noqa: E402
 
 
 def main() -> int:
@@ -55,7 +55,7 @@ def main() -> int:
     if certificate.met or arguments.force:
         controller = dataclasses.replace(design.controller, certified=certificate.met)
         out.parent.mkdir(parents=True, exist_ok=True)
-        dump(out, "feedback", controller, comment(certificate, arguments.problem))
+        dump(out, "feedback", flatten(controller), comment(certificate, arguments.problem))
         written.append(out)
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True)
@@ -98,7 +98,12 @@ def write_report(
     as_json = folder / "certificate.json"
     as_json.write_text(json.dumps(_finite(certificate.as_dict()), indent=2) + "\n")
     solved = folder / "problem.yaml"
-    dump(solved, "synthesize", problem, f"Design problem of '{problem.name}', nothing left open.")
+    dump(
+        solved,
+        "synthesize",
+        flatten(problem),
+        f"Design problem of '{problem.name}', nothing left open.",
+    )
     return [as_json, solved, *design_plots.draw(problem, controller, certificate, folder)]
 
 

@@ -12,8 +12,10 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import asdict, replace
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -40,8 +42,10 @@ from piezo_control.identification.measurement import (
     is_bag,
     read_measurement,
 )
-from piezo_control.parameters import ParameterError, build, dump, load
-from piezo_sim.plant.cantilever import CantileverParameters
+from piezo_control.parameters import ParameterError, build, dump, flatten, load
+
+LARGEST_RMS_PERCENT = 5.0
+"""Of the stroke: a straight line through a piezo actuator's loop misses by 6 to 9 %."""
 
 
 def main() -> int:
@@ -90,6 +94,14 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     model = fit(last)
     fits[f"all {last - first} samples, fitted"] = judge(model, slice(first, last))
     show(console, f"{arguments.model} hysteresis of {arguments.recording}", fits)
+    for part, fit_quality in fits.items():
+        if not fit_quality.rms_percent <= LARGEST_RMS_PERCENT:
+            raise MeasurementError(
+                f"{arguments.recording}: the fit explains too little ({part}: rms "
+                f"{fit_quality.rms_percent:.1f} % of the stroke, must be at most "
+                f"{LARGEST_RMS_PERCENT:g} %), nothing written; look for outliers, a reversed sign, "
+                "wrong columns, or hysteresis of another kind"
+            )
     console.print(
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
         f"smoothness {model.smoothness:g}"
@@ -97,7 +109,6 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
     feedforward = FeedforwardParameters(
         static_gain=float(np.ptp(measurement.deflection[first:]) / np.ptp(measurement.voltage)),
-        voltage_limit=float(np.abs(measurement.voltage).max()),
         hysteresis=model.parameters,
     )
     whole = fits[f"all {last - first} samples, fitted"]
@@ -105,10 +116,11 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         f"{arguments.model} hysteresis identified from {arguments.recording}: rms "
         f"{whole.rms_percent:.3f} %, max {whole.maximum_percent:.2f} % of {whole.stroke * 1e6:.2f} um.\n"
         "The deflection shows lag seconds late and with the offset of the sensor; both are no part of the\n"
-        "operator, and the feedforward does not use them. voltage_limit is the largest voltage recorded."
+        "operator, and the feedforward does not use them. The limits of the voltage are\n"
+        "no result of a measurement: they are the defaults until you write what your actuator stands."
     )
     path = arguments.out / "feedforward.yaml"
-    dump(path, "feedforward", feedforward, comment)
+    dump(path, "feedforward", flatten(feedforward), comment)
     with path.open("a") as file:
         yaml.safe_dump(
             {"/**/identification": {"ros__parameters": {"lag": model.lag, "offset": model.offset}}},
@@ -119,7 +131,9 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     plots.loops(measurement, modelled, slice(first, last), picture)
     return [
         path,
-        update_cantilever(arguments.out, comment.splitlines()[0], hysteresis=model.parameters),
+        update_cantilever(
+            arguments.out, comment.splitlines()[0], "hysteresis", flatten(model.parameters)
+        ),
         picture,
         write_json(arguments.out / "hysteresis.json", {n: figures(f) for n, f in fits.items()}),
     ]
@@ -179,21 +193,20 @@ def finish_dynamics(
         "damping_ratio": model.damping_ratio,
         "denominator": model.denominator,
     }
-    change = {"denominator": model.denominator}
+    change: dict[str, Any] = {"denominator": model.denominator}
     if name == "stiffness":
-        found["elastic_constant"] = model.gain
         change = {"elastic_constant": model.gain}
+    found.update(change)
     for key, value in found.items():
         console.print(f"{key}: {value}")
     picture = arguments.out / f"{name}.png"
     curve = np.column_stack((measurement.time, measurement.deflection, modelled))
     plots.responses([(measurement.source, curve)], picture)
-    base = stored_cantilever(arguments.out)
     comment = (
         f"{name} identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke."
     )
     return [
-        update_cantilever(arguments.out, comment, dynamics=replace(base.dynamics, **change)),
+        update_cantilever(arguments.out, comment, "dynamics", change),
         picture,
         write_json(arguments.out / f"{name}.json", {**found, **figures(fit)}),
     ]
@@ -202,8 +215,7 @@ def finish_dynamics(
 def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify creep and thermal deflection from long recordings; update cantilever.yaml."""
     stored = arguments.out / "feedforward.yaml"
-    base = stored_cantilever(arguments.out)
-    operator = stored_hysteresis(stored) if stored.exists() else base.hysteresis
+    operator = stored_hysteresis(stored) if stored.exists() else HysteresisParameters()
     model = identify_drift([read(path, arguments) for path in arguments.recording], operator)
     fits = {
         str(path): quality(curve[:, 1], curve[:, 2])
@@ -215,21 +227,22 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
         console.print(f"{key}: {value}")
     picture = arguments.out / "drift.png"
     plots.responses(list(zip(map(str, arguments.recording), model.fitted)), picture)
-    creep, thermal = base.creep, base.thermal
-    if model.creep_gain + model.creep_gain_per_degc > 0.0:
-        creep = replace(
-            creep,
-            gain=model.creep_gain,
-            gain_per_degc=model.creep_gain_per_degc,
-            times=model.creep_times,
-            shares=model.creep_shares,
-        )
-    if model.time_constant > 0.0:
-        thermal = replace(thermal, sensitivity=model.sensitivity, time_constant=model.time_constant)
     names = ", ".join(map(str, arguments.recording))
     comment = f"Creep and thermal deflection identified from {names}."
+    written = []
+    if model.creep_gain + model.creep_gain_per_degc > 0.0:
+        creep = {
+            "gain": model.creep_gain,
+            "gain_per_degc": model.creep_gain_per_degc,
+            "times": model.creep_times,
+            "shares": model.creep_shares,
+        }
+        written.append(update_cantilever(arguments.out, comment, "creep", creep))
+    if model.time_constant > 0.0:
+        thermal = {"sensitivity": model.sensitivity, "time_constant": model.time_constant}
+        written.append(update_cantilever(arguments.out, comment, "thermal", thermal))
     return [
-        update_cantilever(arguments.out, comment, creep=creep, thermal=thermal),
+        *dict.fromkeys(written),
         picture,
         write_json(
             arguments.out / "drift.json",
@@ -264,21 +277,15 @@ def stored_hysteresis(path: Path) -> HysteresisParameters:
     return build(FeedforwardParameters, load(path, "feedforward"), str(path)).hysteresis
 
 
-def stored_cantilever(out: Path) -> CantileverParameters:
-    """Return what cantilever.yaml of the folder says, the defaults without it."""
+def update_cantilever(out: Path, comment: str, group: str, found: Mapping[str, Any]) -> Path:
+    """Put a `group` of parameters that was found into cantilever.yaml, keeping what is there."""
     path = out / "cantilever.yaml"
-    if not path.exists():
-        return CantileverParameters()
-    return build(CantileverParameters, load(path, "cantilever"), str(path))
-
-
-def update_cantilever(out: Path, comment: str, **groups: object) -> Path:
-    """Replace groups of cantilever.yaml, keeping the rest and the comments of earlier steps."""
-    path = out / "cantilever.yaml"
-    earlier = path.read_text().splitlines() if path.exists() else []
-    comments = [line[2:] for line in earlier if line.startswith("# ")]
-    parameters = replace(stored_cantilever(out), **groups)
-    dump(path, "cantilever", parameters, "\n".join([*comments, comment]))
+    values, comments = {}, []
+    if path.exists():
+        values = load(path, "cantilever")
+        comments = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
+    values.update({f"{group}.{name}": value for name, value in found.items()})
+    dump(path, "cantilever", values, "\n".join(dict.fromkeys([*comments, comment])))
     return path
 
 

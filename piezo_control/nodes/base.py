@@ -6,23 +6,31 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy._rclpy_pybind11 import RCLError, RCLInvalidROSArgsError, UnknownROSArgsError
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
 
 from piezo_control.nodes import spin
 from piezo_control.parameters import ParameterError, build, declarations
+
+DIAGNOSTICS_PERIOD = 1.0  # s
 
 ROS_TYPES = {
     bool: Parameter.Type.BOOL,
@@ -32,6 +40,11 @@ ROS_TYPES = {
     tuple[float, ...]: Parameter.Type.DOUBLE_ARRAY,
     tuple[str, ...]: Parameter.Type.STRING_ARRAY,
 }
+
+
+def system_time() -> Time:
+    """Return the time of the clock on the wall as a stamp, whatever simulated time says."""
+    return Clock().now().to_msg()
 
 
 class FingerNode(LifecycleNode):
@@ -64,10 +77,30 @@ class FingerNode(LifecycleNode):
             else:
                 value = list(default) if isinstance(default, tuple) else default
                 self.declare_parameter(name, value, describe(name, kind, field))
-        self.parameters = build(self.PARAMETERS, self._values({}), self.NAME)
+        self.parameters: Any = build(self.PARAMETERS, self._values({}), self.NAME)
         self.active = False
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_steady_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
+        self.create_service(Trigger, "~/reset", self._on_reset)
         self.add_on_set_parameters_callback(self._validate)
         self.add_post_set_parameters_callback(self._changed)
+
+    def create_steady_timer(
+        self, period: float, callback: Callable[[], None], autostart: bool = True
+    ) -> Timer:
+        """Return a timer (s) that neither simulated time nor a change of the system's clock can stop."""
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        return self.create_timer(period, callback, clock=steady, autostart=autostart)
+
+    def reset(self) -> None:
+        """Leave a latched fault; a ValueError raised here says why that cannot be."""
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        """Return what is wrong, in words (empty: nothing), and figures for `/diagnostics`."""
+        return "", {}
+
+    def check(self, parameters: Any) -> None:
+        """Raise ValueError if `parameters`, each of them valid, cannot follow the present ones."""
 
     def start(self) -> None:
         """Begin to work with `self.parameters`; a ValueError raised here refuses the activation."""
@@ -99,6 +132,48 @@ class FingerNode(LifecycleNode):
         self._halt()
         return super().on_shutdown(state)
 
+    def trigger_shutdown(self) -> TransitionCallbackReturn:
+        """Shut down, also from the state in which that has been done already."""
+        try:
+            return super().trigger_shutdown()
+        except RCLError:
+            return TransitionCallbackReturn.FAILURE
+
+    def _LifecycleNodeMixin__change_state(self, transition_id: int) -> TransitionCallbackReturn:
+        # Every transition goes through this method of rclpy's mixin, which lets an impossible one end the
+        # process. A client that asks for one gets "no" instead.
+        try:
+            return super()._LifecycleNodeMixin__change_state(transition_id)
+        except RCLError:
+            self.get_logger().warning(f"transition {transition_id} is not possible in this state")
+            return TransitionCallbackReturn.FAILURE
+
+    def publish_diagnostics(self) -> None:
+        """Publish the state of this node on `/diagnostics`."""
+        wrong, figures = self.report()
+        status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id="piezo_gripper")
+        status.level = DiagnosticStatus.ERROR if wrong else DiagnosticStatus.OK
+        status.message = wrong or ("active" if self.active else "not active")
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in figures.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = system_time()
+        self._diagnostics.publish(message)
+
+    def _on_reset(self, _: Trigger.Request, answer: Trigger.Response) -> Trigger.Response:
+        wrong, _ = self.report()
+        try:
+            self.reset()
+        except ValueError as error:
+            answer.success, answer.message = False, str(error)
+        else:
+            answer.success, answer.message = (
+                True,
+                f"reset; it was: {wrong}" if wrong else "no fault",
+            )
+            self.get_logger().info(answer.message)
+        self.publish_diagnostics()
+        return answer
+
     def _halt(self) -> None:
         if self.active:
             self.stop()
@@ -113,14 +188,18 @@ class FingerNode(LifecycleNode):
         }
 
     def _validate(self, changes: list[Parameter]) -> SetParametersResult:
-        ours = {p.name: p.value for p in changes if p.name in self._declarations}
+        before = self._values({})
+        after = self._values({p.name: p.value for p in changes if p.name in before})
+        ours = {name: value for name, value in after.items() if value != before[name]}
         frozen = self.refuses_while_active(set(ours)) if self.active else set()
         if frozen:
             reason = f"{', '.join(sorted(frozen))}: deactivate '{self.NAME}' first"
             return SetParametersResult(successful=False, reason=reason)
         try:
-            build(self.PARAMETERS, self._values(ours))
-        except ParameterError as error:
+            wanted = build(self.PARAMETERS, self._values(ours))
+            if ours:
+                self.check(wanted)
+        except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
@@ -129,6 +208,11 @@ class FingerNode(LifecycleNode):
             self.parameters = build(self.PARAMETERS, self._values({}), self.NAME)
             if self.active:
                 self.apply()
+
+
+def parameter_type(cls: type, name: str) -> Parameter.Type:
+    """Return the ROS type of the parameter `name` of a parameter dataclass."""
+    return ROS_TYPES[declarations(cls)[name][0]]
 
 
 def describe(name: str, kind: type, field: Any) -> ParameterDescriptor:
@@ -153,24 +237,28 @@ def describe(name: str, kind: type, field: Any) -> ParameterDescriptor:
 
 
 def run(*node_types: type[FingerNode]) -> int:
-    """Run nodes in this process until SIGINT or SIGTERM; return its exit code.
+    """Run nodes in this process until a signal ends it; return its exit code.
 
     Several nodes start in the order given and stop in the opposite one.
     """
-    parse(node_types)
-    spin.init()
     stop = spin.stop_event()
     nodes: list[FingerNode] = []
     try:
+        parse(node_types)
+        spin.init()
         for node_type in node_types:
             nodes.append(node_type())
         for node in nodes:
             if node.get_parameter("autostart").value:
-                node.trigger_configure()
-                node.trigger_activate()
+                if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                    node.trigger_activate()
         spin.spin(nodes, stop.is_set)
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
-        print(f"{node_types[len(nodes)].NAME}: {error}", file=sys.stderr)
+        print(f"{node_types[min(len(nodes), len(node_types) - 1)].NAME}: {error}", file=sys.stderr)
+        return 2
+    except (RCLError, RCLInvalidROSArgsError, UnknownROSArgsError) as error:
+        # A parameter file or an argument that rcl cannot read; its first line names it.
+        print(f"{node_types[0].NAME}: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
     finally:
         for node in reversed(nodes):

@@ -1,94 +1,206 @@
 # SPDX-License-Identifier: Apache-2.0
 """A block of the loop: one numbered sample in, one out, each answered exactly once.
 
-The rule that makes the loop deterministic whatever the transport does. A sample numbered one more than
-the last is computed and published. The last number again is a request to repeat: the stored answer is
-published, nothing is computed. Number 0 starts a new run. Anything else means that somebody else
-answered samples of this topic, which no order of computation can mend: the node says so and goes
-silent, and the cantilever runs into its time limit and to 0 V.
+In lock-step, that makes the loop deterministic whatever the transport does (:mod:`piezo_control.sequence`):
+a stray sample means that somebody else answered samples of this topic, which no order of computation can
+mend. Running free, only the newest sample counts, and one that is too old is not acted upon.
+
+What cannot be right latches a fault (:mod:`piezo_control.safety`): a second publisher of the input, samples
+at another sample time than this block's, samples of the other mode. The block then answers no more, and
+its neighbours run into their time limits, until `~/reset` or the next activation.
 """
 
 from __future__ import annotations
 
-import math
+import time
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.qos import SAMPLE
-from piezo_control.parameters import parameter
-from piezo_gripper_msgs.msg import Sample
+from piezo_control.nodes.qos import LATCHED, NEWEST, SAMPLE
+from piezo_control.safety import Guard, is_physical
+from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
+from piezo_gripper_msgs.msg import FingerState, Sample
 
-MODE = "lockstep: every sample once, in order; free_running: the newest sample, with watchdogs"
-MODES = ("lockstep", "free_running")
-
-
-def mode() -> str:
-    """Declare the parameter `mode` of a node of the loop."""
-    return parameter("lockstep", MODE, choices=MODES)
+SIMULATED_TIME = 1e8  # s: a stamp below is no time of a clock on a wall
 
 
-def subscribers() -> int:
-    """Declare the parameter `subscribers` of a node of the loop."""
-    return parameter(
-        1,
-        "lock-step: sample 0 waits for so many subscribers of the output: the next block, a recorder",
-        low=0,
-        high=100,
+def seconds(stamp: Any) -> float:
+    """Return a message's time stamp in s."""
+    return stamp.sec + stamp.nanosec * 1e-9
+
+
+def wrong_time(sample: Sample, topic: str, parameters: Any, name: str) -> str:
+    """Say what is wrong with the time of a sample for a node that runs with `parameters`; empty: nothing."""
+    h = parameters.sample_time
+    if sample.period and abs(sample.period - h) > 1e-6 * h:
+        return f"'{topic}' comes every {sample.period:g} s, must come at the sample time of '{name}': {h:g} s"
+    stamp = seconds(sample.header.stamp)
+    if stamp and (stamp > SIMULATED_TIME) != (parameters.mode == "free_running"):
+        other = "free_running" if stamp > SIMULATED_TIME else "lockstep"
+        return f"'{topic}' is sent in mode '{other}', '{name}' is in mode '{parameters.mode}'"
+    return ""
+
+
+def publishers(node: Node, topic: str) -> str:
+    """Name the nodes that publish `topic`; the name of one that has just started may not be known yet."""
+    found = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    return ", ".join(
+        "a node just started"
+        if "UNKNOWN" in publisher.node_name
+        else f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+        for publisher in found
     )
 
 
-class SampleFilterNode(FingerNode):
+class BlockNode(FingerNode):
     """Subscribe `INPUT`, publish `OUTPUT`; a subclass says what becomes of a value."""
 
     INPUT: str
     OUTPUT: str
+    LARGEST: float
+    """Size of the input beyond which it is a mistake."""
 
     def __init__(self) -> None:
         super().__init__()
         self.answers = self.create_publisher(Sample, self.OUTPUT, SAMPLE)
-        self.create_subscription(Sample, self.INPUT, self._on_sample, SAMPLE)
         self.last = Sample()
-        self.expected = -1
+        self.sequence = Sequence()
+        self.guard = Guard(hold_time=1.0)
+        self.finger: FingerState | None = None
+        self.create_subscription(FingerState, "state", self._on_state, LATCHED)
+        self.publisher_count = 0
+        self._qos: QoSProfile | None = None
+        self._subscription: Subscription | None = None
+        self._listen()
 
     def restart(self) -> None:
         """Take up a new run, before its first sample."""
         raise NotImplementedError
 
-    def compute(self, number: int, value: float) -> float:
-        """Return the answer to sample `number`."""
+    def compute(self, number: int, value: float) -> float | None:
+        """Return the answer to sample `number`, None when there is none yet."""
         raise NotImplementedError
 
+    def limited(self) -> bool:
+        """Say whether a limit acted on the last answer."""
+        return False
+
+    def trip(self, cause: str) -> None:
+        """Latch a fault."""
+        if not self.guard.is_latched:
+            self.get_logger().error(f"{cause}; no more answers until '~/reset' or a new activation")
+        self.guard.trip(cause, time.monotonic())
+        self.publish_diagnostics()
+
     def start(self) -> None:
-        self.expected = -1
-        self.restart()
+        self._listen()
+        self.sequence = Sequence(gaps=self.parameters.mode == "free_running")
+        self.guard.reset()
+        self._look_for_doubles()
+
+    def reset(self) -> None:
+        self.guard.reset()
+        self._look_for_doubles()
+        if self.guard.is_latched:
+            raise ValueError(self.guard.cause)
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        figures = {"sample": self.sequence.next - 1, "faults": self.guard.times}
+        return self.guard.cause, figures
+
+    def _listen(self) -> None:
+        """Subscribe the input with the quality of service of the mode."""
+        qos = SAMPLE if self.parameters.mode == "lockstep" else NEWEST
+        if qos is self._qos:
+            return
+        if self._subscription:
+            self.destroy_subscription(self._subscription)
+        self._qos = qos
+        self._subscription = self.create_subscription(
+            Sample, self.INPUT, self._on_sample, qos,
+            event_callbacks=SubscriptionEventCallbacks(matched=self._on_matched),
+        )  # fmt: skip
+
+    def _on_matched(self, matched: Any) -> None:
+        self.publisher_count = matched.current_count
+        if self.active:
+            self._look_for_doubles()
+
+    def _look_for_doubles(self) -> None:
+        if self.publisher_count > 1:
+            self.trip(
+                f"'{self.resolve_topic_name(self.INPUT)}' has {self.publisher_count} publishers: "
+                f"{publishers(self, self.INPUT)}"
+            )
+
+    def _on_state(self, state: FingerState) -> None:
+        self.finger = state
+
+    def _is_new_run(self) -> bool:
+        """Say whether a sample 0 may begin a run: not in the middle of one, as the finger's state has it."""
+        return (
+            self.sequence.next <= 0
+            or self.finger is None
+            or self.finger.phase != FingerState.RUNNING
+            or self.finger.samples <= 1
+        )
 
     def _on_sample(self, sample: Sample) -> None:
-        if not self.active:
+        if not self.active or self.guard.is_latched:
             return
         number = sample.number
-        if number != self.expected:
-            if number == self.expected - 1:
-                self.answers.publish(self.last)
-                return
-            if number == 0:
-                if self.answers.get_subscription_count() < self.parameters.subscribers:
-                    return  # the cantilever asks again
-                if self.expected > 0:
-                    self.restart()
-            elif self.expected >= 0 and self.parameters.mode == "lockstep":
-                self.get_logger().error(
-                    f"'{self.INPUT}' brought sample {number}, expected {self.expected}: "
-                    "does another node answer this topic?",
-                    throttle_duration_sec=1.0,
-                )
-                return
-        if not math.isfinite(sample.value):
+        lockstep = self.parameters.mode == "lockstep"
+        kind = self.sequence.classify(number)
+        if kind == REPEATED and lockstep:
+            self.answers.publish(self.last)
+            return
+        if kind == STRAY or kind == REPEATED:
             self.get_logger().error(
-                f"'{self.INPUT}' sample {number} is {sample.value}, must be finite; not answered",
+                f"'{self.INPUT}' brought sample {number}, expected {max(self.sequence.next, 0)}: "
+                "does another node answer this topic?",
                 throttle_duration_sec=1.0,
             )
             return
-        answer = Sample(header=sample.header, number=number)
-        answer.value = self.compute(number, sample.value)
+        if kind == FIRST and lockstep:
+            if not self._is_new_run():
+                self.get_logger().error(
+                    f"'{self.INPUT}' brought sample 0 in the middle of a run; ignored",
+                    throttle_duration_sec=1.0,
+                )
+                return
+            if self.answers.get_subscription_count() < self.parameters.subscribers:
+                return  # the cantilever asks again
+        if wrong := wrong_time(sample, self.INPUT, self.parameters, self.NAME):
+            self.trip(wrong)
+            return
+        if not is_physical(sample.value, self.LARGEST):
+            self.get_logger().error(
+                f"'{self.INPUT}' sample {number} is {sample.value}, must be finite and within "
+                f"±{self.LARGEST:g}; not answered",
+                throttle_duration_sec=1.0,
+            )
+            return
+        stamp = seconds(sample.header.stamp)
+        if not lockstep and stamp and time.time() - stamp > self.parameters.age_limit:
+            self.get_logger().error(
+                f"'{self.INPUT}' sample {number} is {time.time() - stamp:.2g} s old, must be at most "
+                f"{self.parameters.age_limit:g} s; not acted upon",
+                throttle_duration_sec=1.0,
+            )
+            return
+        if kind == FIRST and lockstep and self.sequence.next != 0:
+            self.restart()
+        self.sequence.count(number)
+        value = self.compute(number, sample.value)
+        if value is None:
+            return
+        answer = Sample(header=sample.header, number=number, period=self.parameters.sample_time)
+        answer.value = value
+        answer.limited = self.limited()
         self.answers.publish(answer)
         self.last = answer
-        self.expected = number + 1

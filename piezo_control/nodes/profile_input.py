@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from rclpy.node import Node
 
 from piezo_control.nodes.qos import LATCHED, SETPOINT
@@ -14,9 +15,10 @@ from piezo_gripper_msgs.msg import Sample
 class ProfileInput:
     """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k."""
 
-    def __init__(self, node: Node, topic: str, sample_time: float) -> None:
+    def __init__(self, node: Node, topic: str, sample_time: float, largest: float) -> None:
         self._node = node
         self._topic = topic
+        self._largest = largest
         self._sampled = SampledProfile(Profile([0.0], [0.0]), sample_time)
         node.create_subscription(Sample, topic, self._on_value, SETPOINT)
         node.create_subscription(ProfileMessage, f"{topic}_profile", self._on_profile, LATCHED)
@@ -38,6 +40,11 @@ class ProfileInput:
     def _take(self, topic: str, time: list[float], value: list[float], linear: bool) -> None:
         try:
             profile = Profile(time, value, linear)
+            if not np.all(np.abs(profile.value) <= self._largest):
+                raise ValueError(
+                    f"value is up to {np.max(np.abs(profile.value)):g}, must be within "
+                    f"±{self._largest:g}; the unit is that of the topic, m or N"
+                )
         except ValueError as error:
             self._node.get_logger().error(f"'{topic}' ignored: {error}")
             return

@@ -6,6 +6,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 # Numbered samples: reliable, and deep enough that a recorder may fall behind by seconds.
 SAMPLE = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
 
+# Numbered samples of a loop that runs free: what is not taken in time is replaced by what is newer.
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+
 # Set-points: reliable, only the newest counts.
 SETPOINT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 

@@ -12,7 +12,6 @@ finger's speed. A run that starts again at sample 0 goes on in the same bag.
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import struct
 import time
@@ -27,8 +26,8 @@ from rosbags.interfaces import Connection
 
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.parameters import RecorderParameters
 from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_control.parameters import parameter
 from piezo_control.recording.recording import PROFILE_TYPE, SAMPLE_TYPE, TEMPERATURE_TYPE
 from piezo_control.recording.writer import BagWriter
 from piezo_gripper_msgs.msg import RecorderState
@@ -46,14 +45,6 @@ FINGER = {
 }
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
 STATE_PERIOD = 0.05  # s
-
-
-@dataclasses.dataclass(frozen=True)
-class RecorderParameters:
-    """Where to write, and what."""
-
-    bag: str = parameter("", "folder to write, new; empty: 'finger_' and the time in this folder")
-    topics: tuple[str, ...] = parameter(tuple(FINGER), "topics to record, relative or absolute")
 
 
 class Track:

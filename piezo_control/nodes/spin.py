@@ -18,7 +18,7 @@ import gc
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import rclpy
 from rclpy.experimental.events_executor import EventsExecutor
@@ -39,14 +39,18 @@ def init(args: list[str] | None = None) -> None:
 
 
 def stop_event() -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set; call from the main thread."""
+    """Return an event that the signals which end a program set; call from the main thread.
+
+    SIGHUP comes from a terminal that is closed; a program started with nohup has it ignored.
+    """
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, lambda *_: stop.set())
     return stop
 
 
-def spin(nodes: list[Node], done: Callable[[], bool]) -> None:
+def spin(nodes: Sequence[Node], done: Callable[[], bool]) -> None:
     """Serve the events of `nodes` in this thread until `done()`, looked at after every event."""
     gc.freeze()  # modules and entities stay; the collector need not visit them between samples
     executor = EventsExecutor()

@@ -29,9 +29,8 @@ from piezo_control.recording.recording import (
 )
 from piezo_control.shared import shared_folder
 
-SAMPLE_CDR = struct.Struct(
-    "<4s i I I 4x Q d"
-)  # encapsulation, stamp, empty frame_id, number, value
+# Encapsulation, stamp, empty frame_id, number, value, period, limited.
+SAMPLE_CDR = struct.Struct("<4s i I I 4x Q d d ?")
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
@@ -91,6 +90,7 @@ def write_recording(
     for name, profile in (("reference", reference), ("tip_force", tip_force)):
         topic = bag.add(f"/{finger}/{name}_profile", PROFILE_TYPE, latched=True)
         bag.write(topic, 0, _profile(bag, profile))
+    period = float(recording.time[1] - recording.time[0]) if recording.time.size > 1 else 0.0
     stamps = np.rint(recording.time * 1e9).astype(int).tolist()
     signals = [
         (bag.add(f"/{finger}/{name}", SAMPLE_TYPE), getattr(recording, name).tolist())
@@ -102,7 +102,9 @@ def write_recording(
         if k in changes:
             bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
         for topic, values in signals:
-            data = SAMPLE_CDR.pack(LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, values[k])
+            data = SAMPLE_CDR.pack(
+                LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, values[k], period, False
+            )
             bag.write(topic, stamp, data)
     bag.close()
 

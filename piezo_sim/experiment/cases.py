@@ -14,14 +14,16 @@ import yaml
 
 from piezo_control.feedforward import Feedforward
 from piezo_control.identification.excitation import decaying_sine
-from piezo_control.nodes.feedback import FeedbackNodeParameters
-from piezo_control.nodes.feedforward import FeedforwardNodeParameters
-from piezo_control.nodes.recorder import RecorderParameters
+from piezo_control.nodes.parameters import (
+    FeedbackNodeParameters,
+    FeedforwardNodeParameters,
+    RecorderParameters,
+)
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
 from piezo_control.shared import shared_folder
-from piezo_sim.nodes.cantilever import CantileverNodeParameters
-from piezo_sim.nodes.temperature import TemperatureNodeParameters
+from piezo_sim.nodes.parameters import CantileverNodeParameters, TemperatureNodeParameters
+from piezo_sim.plant.amplifier import AmplifierParameters
 
 NODES = {
     "feedforward": FeedforwardNodeParameters,
@@ -82,6 +84,12 @@ class Case:
                 "subscribers": 2,
                 "sample_time": self.sample_time,
                 "compensator": "static_gain" if self.mode == "open_loop" else "inverse",
+                # Without feedback the paper's steps are as steep as the amplifier goes.
+                **(
+                    {}
+                    if self.mode == "feedback"
+                    else {"slew_limit": AmplifierParameters().slew_limit}
+                ),
             },
             "feedback": {"subscribers": 2},
             "temperature": {

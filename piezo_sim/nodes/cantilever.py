@@ -13,59 +13,43 @@ on with the wall clock, holds the newest voltage and ramps to 0 V when that gets
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections import deque
 from time import monotonic
+from typing import Any
 
 import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
-from piezo_control.feedforward import toward_zero
-from piezo_control.nodes import base as finger_node
+from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import mode, subscribers
+from piezo_control.nodes.block import publishers, seconds, wrong_time
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_control.parameters import parameter
+from piezo_control.safety import (
+    FAULT,
+    HIGHEST_DEGC,
+    HOLDING,
+    LARGEST_FORCE,
+    LARGEST_VOLTAGE,
+    LOWEST_DEGC,
+    NORMAL,
+    RAMPING,
+    Guard,
+    Limits,
+    is_physical,
+    limits,
+)
 from piezo_gripper_msgs.msg import FingerState, Sample
-from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.nodes.parameters import CantileverNodeParameters
+from piezo_sim.plant.cantilever import Cantilever
 from piezo_sim.temperature import grid_index
 
 STATE_PERIOD = 0.1  # s
 JITTER_WINDOW = 1000  # periods: to sort more takes longer than a period
 RETRY_PERIOD = 0.1  # s
-
-
-@dataclasses.dataclass(frozen=True)
-class CantileverNodeParameters(CantileverParameters):
-    """The plant's parameters and the node's own."""
-
-    mode: str = mode()
-    subscribers: int = subscribers()
-    samples: int = parameter(0, "samples to take, then finish; 0: without end", low=0, high=10**12)
-    ambient_temperature_degc: float = parameter(
-        22.0, "temperature as long as the topic says nothing", unit="°C", low=-50.0, high=150.0
-    )
-    temperature_lockstep: bool = parameter(
-        False, "lock-step waits for the temperature of every sample too, asking by `clock`"
-    )
-    temperature_period: float = parameter(
-        1e-3, "grid on which the temperature comes in lock-step", unit="s", low=1e-6, high=10.0
-    )
-    clock_period: float = parameter(
-        1e-2, "how often `clock` is published", unit="s", low=1e-6, high=10.0
-    )
-    reply_timeout: float = parameter(
-        2.0, "lock-step: how long an answer may take once the loop has run", unit="s",
-        low=0.2, high=3600.0,
-    )  # fmt: skip
-    hold_time: float = parameter(
-        0.1, "running free: how long an old voltage is held before the ramp to 0 V", unit="s",
-        low=1e-3, high=60.0,
-    )  # fmt: skip
-    ramp: float = parameter(1e4, "slope of the ramp to 0 V", unit="V/s", low=1.0, high=1e7)
+PHASES = {HOLDING: FingerState.HOLDING, RAMPING: FingerState.RAMPING, FAULT: FingerState.FAULT}
 
 
 class CantileverNode(FingerNode):
@@ -77,12 +61,16 @@ class CantileverNode(FingerNode):
         self.deflections = self.create_publisher(Sample, "deflection", SAMPLE)
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
-        self.create_subscription(Sample, "voltage", self._on_voltage, SAMPLE)
+        self.create_subscription(
+            Sample, "voltage", self._on_voltage, SAMPLE,
+            event_callbacks=SubscriptionEventCallbacks(matched=self._on_matched),
+        )  # fmt: skip
         self.create_subscription(Temperature, "temperature", self._on_temperature, SAMPLE)
-        self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time)
-        self.create_timer(STATE_PERIOD, self._publish_state)
-        self.watchdog = self.create_timer(RETRY_PERIOD, self._watch, autostart=False)
-        self.tick = self.create_timer(1.0, self._tick, autostart=False)
+        self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
+        self.create_steady_timer(STATE_PERIOD, self._publish_state)
+        self.watchdog = self.create_steady_timer(RETRY_PERIOD, self._watch, autostart=False)
+        self.tick = self.create_steady_timer(1.0, self._tick, autostart=False)
+        self.publisher_count = 0
         self.phase = FingerState.IDLE
         self.text = ""
         self.ticks: deque[float] = deque(maxlen=JITTER_WINDOW)
@@ -91,6 +79,8 @@ class CantileverNode(FingerNode):
     def _reset(self) -> None:
         p = self.parameters
         self.plant = Cantilever(p)
+        self.guard = Guard(p.hold_time)
+        self.limited = 0
         self.tip_force.restart(p.sample_time)
         self.number = 0
         self.asked_again = 0
@@ -100,6 +90,7 @@ class CantileverNode(FingerNode):
         self.temperatures: dict[int, float] = {}
         self.grid = -1
         self.samples_per_clock = max(1, round(p.clock_period / p.sample_time))
+        self.clocked = 0.0
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
         return names - {"reply_timeout", "hold_time", "ramp"}
@@ -107,7 +98,10 @@ class CantileverNode(FingerNode):
     def start(self) -> None:
         self._reset()
         self._enter(FingerState.WAITING)
-        self.heard = monotonic()
+        self.heard = self.begun = monotonic()
+        self._look_for_doubles()
+        if self.phase == FingerState.FAULT:
+            return
         if self.parameters.mode == "lockstep":
             self.watched = -1
             self.watchdog.reset()
@@ -118,16 +112,60 @@ class CantileverNode(FingerNode):
             self.tick.reset()
 
     def stop(self) -> None:
-        if self.phase in (FingerState.WAITING, FingerState.RUNNING):
-            self._end(FingerState.IDLE)
-        else:
+        if self.phase in (FingerState.FINISHED, FingerState.FAULT):
+            self.tick.cancel()
             self._enter(FingerState.IDLE)
+        else:
+            self._end(FingerState.IDLE)
+
+    def apply(self) -> None:
+        self.guard.hold_time = self.parameters.hold_time
+
+    def reset(self) -> None:
+        """Leave a fault: a new run in lock-step; running free, voltages count again."""
+        if self.phase != FingerState.FAULT:
+            return
+        if self.parameters.mode == "lockstep":
+            self.start()
+        else:
+            self.guard.reset()
+            self.pending_voltage = None
+            self._look_for_doubles()
+        if self.guard.is_latched:
+            raise ValueError(self.text)
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        figures = {
+            "samples": self.number,
+            "asked again": self.asked_again,
+            "clipped": self._clipped(),
+        }
+        is_wrong = self.phase in (FingerState.FAULT, FingerState.HOLDING, FingerState.RAMPING)
+        return self.text if is_wrong else "", figures
+
+    def _clipped(self) -> int:
+        return self.limited + self.plant.clipped
+
+    def _limits(self) -> Limits:
+        return limits(self.parameters.amplifier, self.parameters.ramp)
+
+    def _on_matched(self, matched: Any) -> None:
+        self.publisher_count = matched.current_count
+        if self.active:
+            self._look_for_doubles()
+
+    def _look_for_doubles(self) -> None:
+        if self.publisher_count > 1:
+            self._fault(
+                f"'{self.resolve_topic_name('voltage')}' has {self.publisher_count} publishers: "
+                f"{publishers(self, 'voltage')}"
+            )
 
     # --- lock-step ----------------------------------------------------------------------------------
 
     def _measure(self) -> None:
         """Take deflection `self.number` and ask for its voltage."""
-        sample = Sample(number=self.number)
+        sample = Sample(number=self.number, period=self.parameters.sample_time)
         stamp = sample.header.stamp
         stamp.sec, stamp.nanosec = divmod(
             round(self.number * self.parameters.sample_time * 1e9), 10**9
@@ -148,28 +186,34 @@ class CantileverNode(FingerNode):
             self.deflections.publish(self.sample)
 
     def _on_voltage(self, voltage: Sample) -> None:
-        if not self.active or self.phase not in (FingerState.WAITING, FingerState.RUNNING):
+        if not self.active or self.phase in (FingerState.FINISHED, FingerState.FAULT):
             return
         if self.parameters.mode == "free_running":
             self._hold(voltage)
         elif voltage.number == self.number and self.pending_voltage is None:
-            if not math.isfinite(voltage.value):
-                self._fault(f"'voltage' sample {voltage.number} is {voltage.value} V, not finite")
-                return
-            self.pending_voltage = voltage.value
-            self._advance()
+            if wrong := wrong_time(voltage, "voltage", self.parameters, self.NAME):
+                self._fault(wrong)
+            elif not is_physical(voltage.value, LARGEST_VOLTAGE):
+                self._fault(
+                    f"'voltage' sample {voltage.number} is {voltage.value} V, must be finite and within "
+                    f"±{LARGEST_VOLTAGE:g} V"
+                )
+            else:
+                self.limited += voltage.limited
+                self.pending_voltage = voltage.value
+                self._advance()
 
     def _on_temperature(self, message: Temperature) -> None:
-        if not math.isfinite(message.temperature):
+        if not LOWEST_DEGC <= message.temperature <= HIGHEST_DEGC:
             self.get_logger().error(
-                f"'temperature' is {message.temperature} °C, must be finite; ignored",
+                f"'temperature' is {message.temperature} °C, must be within "
+                f"[{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C; ignored",
                 throttle_duration_sec=1.0,
             )
         elif self.parameters.mode == "free_running" or not self.parameters.temperature_lockstep:
             self.temperature = message.temperature
         elif self.active:
-            stamp = message.header.stamp
-            instant = stamp.sec + stamp.nanosec * 1e-9
+            instant = seconds(message.header.stamp)
             self.temperatures[round(instant / self.parameters.temperature_period)] = (
                 message.temperature
             )
@@ -229,52 +273,88 @@ class CantileverNode(FingerNode):
     # --- running free -------------------------------------------------------------------------------
 
     def _hold(self, voltage: Sample) -> None:
-        if math.isfinite(voltage.value):
-            self.pending_voltage = voltage.value
-            self.heard = monotonic()
-        else:
+        """Take a voltage that holds until the next one comes, unless a fault is latched."""
+        now = monotonic()
+        if self.guard.is_latched:
+            return
+        if wrong := wrong_time(voltage, "voltage", self.parameters, self.NAME):
+            self._fault(wrong)
+        elif not is_physical(voltage.value, LARGEST_VOLTAGE):
             self.get_logger().error(
-                f"'voltage' is {voltage.value} V, must be finite; ignored",
+                f"'voltage' is {voltage.value} V, must be finite and within ±{LARGEST_VOLTAGE:g} V; ignored",
                 throttle_duration_sec=1.0,
             )
+        else:
+            self.limited += voltage.limited
+            self.pending_voltage = voltage.value
+            self.guard.hear(now)
 
     def _tick(self) -> None:
+        """Move on by the samples whose time has passed on the wall, then measure and publish the newest."""
         p = self.parameters
-        self.ticks.append(monotonic())
-        sample = Sample(number=self.number)
-        sample.header.stamp = self.get_clock().now().to_msg()
-        sample.value = self.plant.measure()
-        self.deflections.publish(sample)
+        now = monotonic()
+        self.ticks.append(now)
+        was_latched = self.guard.is_latched
+        self.guard.look(now, 2.0 * p.sample_time + RETRY_PERIOD * p.hold_time, "voltage")
+        if self.guard.is_latched and not was_latched:
+            self.get_logger().error(
+                f"{self.guard.cause}: voltage goes to rest and stays there until '~/reset'"
+            )
+        due = int((now - self.begun) / p.sample_time) + 1
+        if p.samples:
+            due = min(due, p.samples)
+        rest = self._limits()
+        for number in range(self.number, due):
+            demand = self.plant.voltage if self.pending_voltage is None else self.pending_voltage
+            if self.guard.is_latched:
+                demand = self.guard.voltage(rest, self.plant.voltage, p.sample_time)
+                self.pending_voltage = None
+            self.plant.advance(demand, self.temperature, self.tip_force[number])
+        self.number = due
+        sample = Sample(number=self.number, value=self.plant.measure(), period=p.sample_time)
+        sample.header.stamp = base.system_time()
         self.sample = sample
-        if self.number % self.samples_per_clock == 0:
+        self.deflections.publish(sample)
+        if now - self.clocked >= p.clock_period:
+            self.clocked = now
             self.clocks.publish(Clock(clock=sample.header.stamp))
-        voltage = self.pending_voltage or 0.0
-        if voltage and monotonic() - self.heard > p.hold_time:
-            step = p.ramp * p.sample_time
-            voltage = toward_zero(voltage, step)
-            self.pending_voltage = voltage
-            self.text = f"no voltage for {p.hold_time:g} s: to 0 V"
-        self.plant.advance(voltage, self.temperature, self.tip_force[self.number])
-        self.number += 1
-        if self.phase == FingerState.WAITING and self.pending_voltage is not None:
-            self._enter(FingerState.RUNNING)
+        self._follow_guard()
         if self.number == p.samples:
             self._end(FingerState.FINISHED)
+
+    def _follow_guard(self) -> None:
+        """Say in `state` what the guard does."""
+        if self.guard.phase == NORMAL:
+            is_waiting = self.pending_voltage is None
+            phase = FingerState.WAITING if is_waiting else FingerState.RUNNING
+            text = f"waiting for '{self.resolve_topic_name('voltage')}'" if is_waiting else ""
+        else:
+            phase, text = PHASES[self.guard.phase], self.guard.cause
+        self.text = text
+        if phase != self.phase:
+            self._enter(phase, text)
 
     # --- ends ---------------------------------------------------------------------------------------
 
     def _fault(self, text: str) -> None:
-        self.get_logger().error(f"{text}; voltage ramped to 0 V")
+        self.guard.trip(text, monotonic())
+        if self.parameters.mode == "free_running":
+            self.get_logger().error(f"{text}; voltage goes to rest and stays there until '~/reset'")
+            return
+        self.get_logger().error(
+            f"{text}; voltage ramped to rest; '~/reset' or a new activation begins a new run"
+        )
         self._end(FingerState.FAULT, text)
 
     def _end(self, phase: int, text: str = "") -> None:
-        """Ramp the finger to 0 V and say how the run ended."""
+        """Ramp the finger to rest and say how the run ended."""
         self.watchdog.cancel()
         self.tick.cancel()
-        step = self.parameters.ramp * self.parameters.sample_time
-        voltage = self.plant.voltage
-        while voltage:
-            voltage = toward_zero(voltage, step)
+        ending = Guard(self.parameters.hold_time)
+        ending.trip(text, monotonic())
+        h, within, voltage = self.parameters.sample_time, self._limits(), self.plant.voltage
+        while ending.phase == RAMPING:
+            voltage = ending.voltage(within, voltage, h)
             self.plant.advance(voltage, self.temperature, 0.0)
         self._enter(phase, text)
 
@@ -290,7 +370,7 @@ class CantileverNode(FingerNode):
         state.voltage = self.plant.voltage
         state.tip_force = self.plant.tip_force
         state.temperature = self.temperature
-        state.clipped = self.plant.clipped
+        state.clipped = self._clipped()
         state.asked_again = self.asked_again
         if len(self.ticks) > 1:
             late = np.abs(np.diff(self.ticks) - self.parameters.sample_time)
@@ -299,4 +379,4 @@ class CantileverNode(FingerNode):
 
 
 def main() -> int:
-    return finger_node.run(CantileverNode)
+    return base.run(CantileverNode)

@@ -11,7 +11,6 @@ request to repeat. Running free, the profile follows the wall clock.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 from rosgraph_msgs.msg import Clock
@@ -19,22 +18,9 @@ from sensor_msgs.msg import Temperature
 
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import mode, subscribers
 from piezo_control.nodes.qos import SAMPLE
-from piezo_control.parameters import parameter
-from piezo_sim.temperature import TemperatureParameters, temperature
-
-
-@dataclasses.dataclass(frozen=True)
-class TemperatureNodeParameters(TemperatureParameters):
-    """The profile's parameters and the node's own."""
-
-    mode: str = mode()
-    subscribers: int = subscribers()
-    ahead: float = parameter(
-        0.02, "lock-step: how far the temperatures travel ahead of the clock; at least two of the "
-        "cantilever's clock periods", unit="s", low=1e-4, high=10.0,
-    )  # fmt: skip
+from piezo_sim.nodes.parameters import TemperatureNodeParameters
+from piezo_sim.temperature import temperature
 
 
 class TemperatureNode(FingerNode):
@@ -45,7 +31,7 @@ class TemperatureNode(FingerNode):
         super().__init__()
         self.temperatures = self.create_publisher(Temperature, "temperature", SAMPLE)
         self.create_subscription(Clock, "clock", self._on_clock, SAMPLE)
-        self.tick = self.create_timer(1.0, self._tick, autostart=False)
+        self.tick = self.create_steady_timer(1.0, self._tick, autostart=False)
         self.next = 0
 
     def start(self) -> None:

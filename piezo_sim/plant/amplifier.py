@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Voltage amplifier: clip, slew rate, bandwidth.
 
-The demanded voltage is clipped to the limits, followed at the slew rate at most, and smoothed by a
-first-order lag 1 / (1 + s / (2 pi bandwidth)). The output is constant within a sample.
+The demanded voltage is kept within the limits of voltage and slew, and smoothed by a first-order lag 1 / (1 + s / (2 pi bandwidth)). The output is constant within a sample.
 """
 
 from __future__ import annotations
@@ -12,45 +11,47 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from piezo_control.parameters import parameter
+from piezo_control.safety import VoltageParameters, limited
 
 
 @dataclass(frozen=True)
-class AmplifierParameters:
-    """Limits of the voltage amplifier; the default is ideal up to ±40 V."""
+class AmplifierParameters(VoltageParameters):
+    """Limits of the voltage amplifier, the last thing between a voltage and the finger."""
 
-    voltage_limit: float = parameter(
-        40.0, "largest voltage of either sign", unit="V", low=1e-3, high=1e4
-    )
-    slew_rate: float = parameter(
-        0.0, "fastest change of the output; 0: unlimited", unit="V/s", low=0.0, high=1e12
-    )
+    slew_limit: float = parameter(
+        # The paper's step of the voltage, 40 V, takes one sample of 0.1 ms.
+        4e5, "fastest change of the output", unit="V/s", low=1e-3, high=1e12,
+    )  # fmt: skip
     bandwidth_hz: float = parameter(
         0.0, "cut-off of the first-order lag; 0: unlimited", unit="Hz", low=0.0, high=1e9
     )
 
 
 class Amplifier(NamedTuple):
-    """Amplifier per sample: limit (V), largest change (V), part of a transient that is left."""
+    """Amplifier per sample: limits (V), largest change (V), part of a transient that is left."""
 
-    limit: float
+    low: float
+    high: float
     change: float
     retained: float
 
 
 def discretize(parameters: AmplifierParameters, sample_time: float) -> Amplifier:
     """Return the amplifier for one sample time (s)."""
-    change = parameters.slew_rate * sample_time if parameters.slew_rate > 0.0 else math.inf
     bandwidth = parameters.bandwidth_hz
-    retained = math.exp(-2.0 * math.pi * bandwidth * sample_time) if bandwidth > 0.0 else 0.0
-    return Amplifier(parameters.voltage_limit, change, retained)
+    return Amplifier(
+        low=parameters.voltage_low,
+        high=parameters.voltage_high,
+        change=parameters.slew_limit * sample_time,
+        retained=math.exp(-2.0 * math.pi * bandwidth * sample_time) if bandwidth > 0.0 else 0.0,
+    )
 
 
 def amplify(output, amplifier: Amplifier, demand: float) -> float:
-    """Return the applied voltage; `output` = [applied voltage, number of clipped demands]."""
-    clipped = min(amplifier.limit, max(-amplifier.limit, demand))
-    if clipped != demand:
-        output[1] += 1.0
+    """Return the applied voltage; `output` = [applied voltage, number of limited demands]."""
     before = output[0]
-    followed = min(before + amplifier.change, max(before - amplifier.change, clipped))
+    followed = limited(amplifier.low, amplifier.high, amplifier.change, before, demand)
+    if followed != demand:
+        output[1] += 1.0
     output[0] = followed + amplifier.retained * (before - followed)
     return output[0]

@@ -17,7 +17,6 @@ both; a sensor zeroed at 0 V behind a negative excursion explains 26 of the 30 Â
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -253,31 +252,6 @@ class Cantilever:
     def clipped(self) -> int:
         """Number of samples whose demanded voltage the amplifier clipped."""
         return int(self._state.amplifier[1])
-
-    def snapshot(self) -> dict:
-        """Return the complete state, random generators included, for `restore`."""
-        return copy.deepcopy(
-            {
-                "samples": self.samples,
-                "state": self._state,
-                "generators": [generator.bit_generator.state for generator in self._generators],
-                "draws": list(self._remaining_draws()),
-            }
-        )
-
-    def restore(self, snapshot: dict) -> None:
-        """Go back to a state that `snapshot` returned, of a cantilever with equal parameters."""
-        snapshot = copy.deepcopy(snapshot)
-        self.samples = snapshot["samples"]
-        self._state = snapshot["state"]
-        for generator, state in zip(self._generators, snapshot["generators"]):
-            generator.bit_generator.state = state
-        self._draws = iter(snapshot["draws"])
-
-    def _remaining_draws(self) -> list[tuple[float, float]]:
-        remaining = list(self._draws)
-        self._draws = iter(remaining)
-        return remaining
 
     def _look(self) -> None:
         draw = next(self._draws, None)

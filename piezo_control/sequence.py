@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbered samples, each answered once: whether a sample is new, repeated, the first of a run, or stray.
+
+A sample numbered one more than the last is new. The last number again is a request to repeat the answer.
+Number 0 begins a run. Anything else is stray: it is not answered, and the count goes on as if it had not come.
+"""
+
+from __future__ import annotations
+
+NEW, REPEATED, FIRST, STRAY = range(4)
+
+
+class Sequence:
+    """The count of one stream of samples.
+
+    With `gaps`, numbers may be left out, as they are when only the newest sample counts: a number above the
+    last one is new, but for a leap of more than `LARGEST_GAP`, which no loss explains.
+    """
+
+    LARGEST_GAP = 10**7
+
+    def __init__(self, gaps: bool = False) -> None:
+        self.gaps = gaps
+        self.next = -1
+        """Number of the sample that comes next; -1 before the first one."""
+
+    def classify(self, number: int) -> int:
+        """Return NEW, REPEATED, FIRST or STRAY; nothing is counted yet."""
+        if number == 0 and self.next != 1:
+            return FIRST
+        if number == self.next - 1:
+            return REPEATED
+        if number == self.next or self.next < 0 and self.gaps:
+            return NEW
+        if self.gaps and self.next < number < self.next + self.LARGEST_GAP:
+            return NEW
+        return STRAY
+
+    def count(self, number: int) -> None:
+        """Take note that sample `number` was answered."""
+        self.next = number + 1

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What can go wrong around a node, on live nodes: the voltage goes to rest, the cause is named, nothing dies."""
+
+import itertools
+import math
+import signal
+import subprocess
+import time
+
+import pytest
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+from test_nodes import EXECUTABLES, TIMEOUT, Neighbour, neighbour, node, sample
+
+from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
+from piezo_gripper_msgs.msg import FingerState, Sample
+
+__all__ = ["neighbour"]  # a fixture of the module above
+SLEW = 4e4 * 1e-4  # V: default slew limit times sample time
+
+
+class Stream:
+    """Samples of one topic at a steady pace, numbered, until stopped."""
+
+    def __init__(self, neighbour: Neighbour, topic: str, value: float, period=0.005, **fields):
+        self.publisher = neighbour.publisher(topic)
+        self.value = value
+        self.fields = fields
+        self.numbers = itertools.count()
+        self.timer = neighbour.node.create_timer(period, self.send)
+
+    def send(self):
+        message = sample(next(self.numbers), self.value)
+        for name, value in self.fields.items():
+            setattr(message, name, value)
+        self.publisher.publish(message)
+
+
+def reset(neighbour, name):
+    return neighbour.ask(Trigger, f"{name}/reset", Trigger.Request())
+
+
+def diagnosed(neighbour, name):
+    """Return a function that gives the newest words of node `name` on /diagnostics."""
+    heard = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
+
+    def words():
+        found = [s for message in heard for s in message.status if s.name.endswith(name)]
+        return found[-1].message if found else ""
+
+    return words
+
+
+@pytest.mark.parametrize("use_sim_time", [False, True])
+def test_silence_ends_at_rest_and_stays_there_until_a_reset(neighbour, tmp_path, use_sim_time):
+    parameters = {"mode": "free_running", "hold_time": 0.2, "use_sim_time": use_sim_time}
+    with node("feedforward", tmp_path, **parameters):
+        voltages = neighbour.listen(Sample, "voltage")
+        words = diagnosed(neighbour, "feedforward")
+        stream = Stream(neighbour, "command", 18e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 25.0)
+        stream.timer.cancel()
+        neighbour.wait(lambda: voltages[-1].value == 0.0)
+        neighbour.wait(lambda: words() == "no command for 0.2 s")
+        stream.timer.reset()  # the command is back, the voltage is not
+        count = len(voltages)
+        neighbour.wait(lambda: next(stream.numbers) and stream.timer.is_ready() or True)
+        answer = reset(neighbour, "feedforward")
+        assert answer.success and "no command for 0.2 s" in answer.message
+        assert all(v.value == 0.0 for v in voltages[count:])
+        neighbour.wait(lambda: voltages[-1].value > 25.0)
+    steps = [abs(b.value - a.value) for a, b in zip(voltages, voltages[1:])]
+    assert max(steps) <= 10.0 * (
+        1 + 1e-9
+    )  # the ramp, 1e4 V/s, per ms; the slew limit is 4 V a sample
+
+
+@pytest.mark.parametrize("end", ["deactivation", "SIGTERM", "SIGHUP", "SIGQUIT"])
+def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
+    with node("feedforward", tmp_path) as processes:
+        voltages = neighbour.listen(Sample, "voltage")
+        command = neighbour.publisher("command")
+        neighbour.insist(command, sample(0, 5e-6), lambda: voltages)
+        for number in range(1, 10):
+            command.publish(sample(number, 18e-6))
+            neighbour.wait(lambda n=number: voltages[-1].number == n)
+        assert voltages[-1].value > 30.0
+        if end == "deactivation":
+            assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
+        else:
+            process = processes.running["feedforward"]
+            process.send_signal(signal.Signals[end])
+            assert process.wait(TIMEOUT) == 0
+        neighbour.wait(lambda: voltages[-1].value == 0.0)
+
+
+def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighbour, tmp_path):
+    states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+    states.publish(FingerState(phase=FingerState.RUNNING, samples=1000, voltage=36.9))
+    with node("feedforward", tmp_path, autostart=False, mode="free_running"):
+        voltages = neighbour.listen(Sample, "voltage")
+        neighbour.wait(lambda: states.get_subscription_count() > 0)
+        assert states.wait_for_all_acked()
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_CONFIGURE)
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_ACTIVATE)
+        Stream(neighbour, "command", 0.0)
+        neighbour.wait(lambda: voltages)
+    assert abs(voltages[0].value - 36.9) <= SLEW * (1 + 1e-9)
+
+
+def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
+    with node("feedforward", tmp_path, mode="free_running"):
+        voltages = neighbour.listen(Sample, "voltage")
+        words = diagnosed(neighbour, "feedforward")
+        stream = Stream(neighbour, "command", 18e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 25.0)
+        second = neighbour.node.create_publisher(Sample, "command", SAMPLE)
+        neighbour.wait(lambda: voltages[-1].value == 0.0)
+        neighbour.wait(lambda: "'/command' has 2 publishers: /neighbour" in words())
+        assert not reset(neighbour, "feedforward").success  # they are both still there
+        neighbour.node.destroy_publisher(second)
+        neighbour.wait(lambda: reset(neighbour, "feedforward").success)
+        neighbour.wait(lambda: voltages[-1].value > 25.0)
+        assert stream
+
+
+def test_an_impossible_transition_is_answered_with_no(neighbour, tmp_path):
+    with node("feedback", tmp_path) as processes:
+        assert not neighbour.change_state("feedback", Transition.TRANSITION_CONFIGURE)
+        assert neighbour.change_state("feedback", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert not neighbour.change_state("feedback", Transition.TRANSITION_ACTIVATE)
+        process = processes.running["feedback"]
+        assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(TIMEOUT) == 0
+    assert "Traceback" not in (tmp_path / "feedback.log").read_text()
+
+
+@pytest.mark.parametrize(
+    "fields, words",
+    [
+        (
+            {"period": 1e-3},
+            "comes every 0.001 s, must come at the sample time of 'feedback': 0.0001 s",
+        ),
+        ({"stamped": True}, "is sent in mode 'free_running', 'feedback' is in mode 'lockstep'"),
+    ],
+    ids=["sample time", "mode"],
+)
+def test_samples_of_another_loop_are_refused_by_name(neighbour, tmp_path, fields, words):
+    with node("feedback", tmp_path, "feedback_robust.yaml"):
+        commands = neighbour.listen(Sample, "command")
+        said = diagnosed(neighbour, "feedback")
+        deflection = neighbour.publisher("deflection")
+        first = sample(0, 0.0)
+        first.period = fields.get("period", 0.0)
+        if "stamped" in fields:
+            first.header.stamp.sec = int(time.time())
+        neighbour.insist(deflection, first, lambda: words in said())
+    assert commands == []
+
+
+def test_an_old_sample_is_not_acted_upon(neighbour, tmp_path):
+    with node("feedforward", tmp_path, mode="free_running") as processes:
+        voltages = neighbour.listen(Sample, "voltage")
+        command = neighbour.publisher("command")
+        old = sample(5, 18e-6)
+        old.header.stamp.sec = int(time.time()) - 3
+        neighbour.insist(
+            command, old, lambda: "old, must be at most 0.05 s" in log(tmp_path, "feedforward")
+        )
+        assert processes.running["feedforward"].poll() is None
+    assert [v for v in voltages if v.value] == []
+
+
+def log(folder, name):
+    return (folder / f"{name}.log").read_text()
+
+
+def test_a_stray_number_does_not_stop_the_count(neighbour, tmp_path):
+    with node("feedback", tmp_path):
+        commands = neighbour.listen(Sample, "command")
+        deflection = neighbour.publisher("deflection")
+        deflection.publish(sample(2**64 - 1, 0.0))
+        neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
+        deflection.publish(sample(2**64 - 1, 0.0))
+        deflection.publish(sample(1, 1e-6))
+        neighbour.wait(lambda: commands[-1].number == 1)
+
+
+@pytest.mark.parametrize("nonsense", [1.7e308, 20.0, math.inf, math.nan])
+def test_a_reference_that_no_finger_reaches_is_refused(neighbour, tmp_path, nonsense):
+    with node("feedback", tmp_path, "feedback_robust.yaml"):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        reference.publish(sample(0, nonsense))
+        neighbour.insist(
+            deflection,
+            sample(0, 0.0),
+            lambda: commands and "'reference' ignored" in log(tmp_path, "feedback"),
+        )
+        reference.publish(sample(0, 1e-6))
+        assert reference.wait_for_all_acked()
+        for number in range(1, 40):
+            deflection.publish(sample(number, 0.0))
+            neighbour.wait(lambda n=number: commands[-1].number == n)
+    assert all(math.isfinite(c.value) for c in commands)
+    assert 0.0 < commands[-1].value < 22e-6
+
+
+def test_a_controller_changes_as_a_whole_or_not_at_all(neighbour, tmp_path):
+    """One parameter after the other, as tools that load parameter files send them."""
+    second = {
+        "controller": "state_space", "name": "b", "certified": True, "sample_time": 1e-4,
+        "a": [0.9, 0.0, 0.0, 0.8], "b": [0.1, 0.1], "c": [0.5, 0.5], "d": 0.9,
+        "anti_windup": [0.1, 0.1],
+    }  # fmt: skip
+    with node("feedback", tmp_path, "feedback_paper.yaml"):
+        before = neighbour.get("feedback", "a")
+        request = SetParameters.Request(
+            parameters=[Parameter(n, value=v).to_parameter_msg() for n, v in second.items()]
+        )
+        results = neighbour.ask(SetParameters, "feedback/set_parameters", request).results
+        assert any("changes as a whole" in r.reason for r in results)
+        assert neighbour.get("feedback", "name") == "paper"
+        assert list(neighbour.get("feedback", "a")) == list(before)
+        path = tmp_path / "b.yaml"
+        path.write_text(yaml.safe_dump({"/**/feedback": {"ros__parameters": second}}))
+        assert neighbour.set("feedback", controller_file=str(path)).successful
+        neighbour.wait(lambda: neighbour.get("feedback", "name") == "b")
+        assert list(neighbour.get("feedback", "a")) == second["a"]
+        answer = neighbour.set("feedback", controller_file="robsut")
+        assert not answer.successful and "robust" in answer.reason
+        assert neighbour.get("feedback", "name") == "b"
+
+
+def test_a_changed_parameter_is_used_before_the_first_sample(neighbour, tmp_path):
+    with node("feedback", tmp_path):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        assert neighbour.set("feedback", command_high=5e-6).successful
+        reference.publish(sample(0, 10e-6))
+        assert reference.wait_for_all_acked()
+        neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
+    assert commands[0].value == 5e-6
+
+
+def test_an_uncertified_controller_is_said_loudly(neighbour, tmp_path):
+    with node("feedback", tmp_path, "feedback_paper.yaml"):
+        neighbour.publisher("deflection")
+        neighbour.wait(lambda: "controller 'paper'" in log(tmp_path, "feedback"))
+    assert "not certified" in log(tmp_path, "feedback")
+
+
+def test_a_loop_at_another_rate_than_the_controllers_is_not_driven(neighbour, tmp_path):
+    parameters = {"mode": "free_running"}
+    with node("feedback", tmp_path, "feedback_robust.yaml", **parameters):
+        commands = neighbour.listen(Sample, "command")
+        Stream(neighbour, "deflection", 0.0, period=0.005)
+        neighbour.wait(
+            lambda: "controller 'robust' was made for 0.1 ms" in log(tmp_path, "feedback")
+        )
+    assert commands == []
+
+
+def test_a_free_cantilever_latches_and_moves_with_the_wall_clock(neighbour, tmp_path):
+    parameters = {"mode": "free_running", "sample_time": 0.005, "hold_time": 0.1}
+    with node("cantilever", tmp_path, **parameters) as processes:
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        deflections = neighbour.listen(Sample, "deflection")
+        stream = Stream(neighbour, "voltage", 20.0)
+        neighbour.wait(lambda: any(s.voltage == 20.0 for s in states))
+        process = processes.running["cantilever"]
+        process.send_signal(signal.SIGSTOP)
+        before = time.monotonic()
+        neighbour.wait(lambda: time.monotonic() - before > 0.5)
+        process.send_signal(signal.SIGCONT)
+        count = len(deflections)
+        neighbour.wait(lambda: len(deflections) > count + 20)
+        stream.timer.cancel()
+        neighbour.wait(lambda: states[-1].phase == FingerState.FAULT)
+        assert states[-1].text == "no voltage for 0.1 s" and states[-1].voltage == 0.0
+        stream.timer.reset()
+        count = states[-1].samples
+        neighbour.wait(lambda: states[-1].samples > count + 50)
+        assert states[-1].phase == FingerState.FAULT and states[-1].voltage == 0.0
+        assert reset(neighbour, "cantilever").success
+        neighbour.wait(lambda: states[-1].voltage == 20.0 and states[-1].text == "")
+    stamps = [d.header.stamp.sec + d.header.stamp.nanosec * 1e-9 for d in deflections]
+    behind = [t - d.number * d.period for t, d in zip(stamps, deflections)]
+    # A stamp is taken a moment after the count of samples, on a busy machine a long moment.
+    assert max(behind) - min(behind) < 0.3
+    assert deflections[-1].number > len(deflections) + 50  # the halt is in the numbers
+
+
+def test_a_wild_voltage_neither_moves_the_tip_nor_goes_unnoticed(neighbour, tmp_path):
+    with node("cantilever", tmp_path):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        deflections = neighbour.listen(Sample, "deflection")
+        voltage = neighbour.publisher("voltage")
+        neighbour.wait(lambda: deflections)
+        neighbour.insist(voltage, sample(0, 20.0), lambda: deflections[-1].number == 1)
+        voltage.publish(sample(1, 1e6))
+        neighbour.wait(lambda: states[-1].phase == FingerState.FAULT)
+    assert "'voltage' sample 1 is 1000000.0 V" in states[-1].text
+    assert states[-1].voltage == 0.0
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (["--params-file", "/nowhere/at/all.yaml"], "/nowhere/at/all.yaml"),
+        (["-p", "voltage_high"], "voltage_high"),
+        (["-p", "voltage_high:=1.0e308"], "voltage_high"),
+        (["-p", "voltage_high:=[1.0, 2.0]"], "voltage_high"),
+        (["-p", "voltage_high:=text"], "voltage_high"),
+    ],
+    ids=lambda value: value[-1] if isinstance(value, list) else "",
+)
+def test_unusable_arguments_end_with_one_line(arguments, words):
+    done = subprocess.run(
+        [EXECUTABLES / "feedforward", "--ros-args", *arguments],
+        capture_output=True, text=True, timeout=TIMEOUT,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert words in done.stderr and "Traceback" not in done.stderr

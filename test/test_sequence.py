@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbered samples: whatever comes in between, each is answered once and in order."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from piezo_control.sequence import FIRST, NEW, REPEATED, STRAY, Sequence
+
+strays = st.lists(st.integers(2, 2**64 - 1), max_size=3)
+
+
+@given(st.lists(strays, min_size=1, max_size=40))
+def test_strays_neither_count_nor_stop_the_count(between):
+    sequence = Sequence()
+    for number, wild in enumerate(between):
+        for stray in wild:
+            expected = {number: NEW, number - 1: REPEATED}.get(stray, STRAY)
+            assert sequence.classify(stray) == (expected if number else STRAY)
+        assert sequence.classify(number) == (NEW if number else FIRST)
+        sequence.count(number)
+        assert sequence.classify(number) == REPEATED
+
+
+def test_zero_begins_again():
+    sequence = Sequence()
+    for number in (0, 1, 2):
+        sequence.count(number)
+    assert sequence.classify(0) == FIRST
+
+
+@given(st.lists(st.integers(1, 1000), max_size=40))
+def test_where_only_the_newest_counts_numbers_may_be_left_out(steps):
+    sequence = Sequence(gaps=True)
+    number = 10
+    assert sequence.classify(number) == NEW  # it may join at any time
+    sequence.count(number)
+    for step in steps:
+        number += step
+        assert sequence.classify(number) == NEW
+        assert sequence.classify(2**64 - 1) == STRAY
+        sequence.count(number)
+        assert sequence.classify(number - 2) in (STRAY, FIRST)
