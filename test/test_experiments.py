@@ -277,7 +277,11 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     options = ("--engine", "--amplitude-um", 10, "--temperature", 25, 32, "--duration", 0.2)
     assert run_cli(monkeypatch, "step", "--out", out, *options) == 1  # no warm-up within 0.2 s
     assert "does not change" in capsys.readouterr().err
+    assert not out.exists()  # what failed is beside it
     options = ("--engine", "--amplitude-um", 10, "--temperature", 25, 32, "--plant", "truth")
+    out.mkdir()
+    mine = out / "notes.txt"
+    mine.write_text("a day's work")
     assert run_cli(monkeypatch, "step", "--out", out, *options) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert run_cli(monkeypatch, "step", "--out", out, "--overwrite", *options) == 0
@@ -292,6 +296,14 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 3 and "http" not in page
 
+    assert mine.read_text() == "a day's work"
+    assert (
+        run_cli(monkeypatch, "step", "--out", out, "--overwrite", "--duration", 0.2, "--engine")
+        == 1
+    )
+    assert json.loads((out / "metrics.json").read_text()) == content  # a failure replaces nothing
+    capsys.readouterr()
+
     first, second = (out / "bags" / f"step_feedback_{t}degc" for t in (25, 32))
     assert run_cli(monkeypatch, "analyse", first, "--out", tmp_path / "a") == 0
     case = content["cases"][4]
@@ -304,6 +316,26 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     assert "different kinds" in capsys.readouterr().err
     assert run_cli(monkeypatch, "analyse", out, "--out", tmp_path / "a") == 1
     assert "no .mcap or .db3 file" in capsys.readouterr().err
+    assert run_cli(monkeypatch, "analyse", first, "--out", out) == 0  # beside the recordings
+    assert first.exists() and other.exists()
+    assert run_cli(monkeypatch, "analyse", first, "--out", mine) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def test_recover_makes_a_whole_bag_of_a_cut_one(monkeypatch, tmp_path, capsys):
+    _, (case, *_) = read_experiment("step", {"duration": 0.06})
+    bag = run_on_engine(case, tmp_path, "finger", Progress(disable=True)).bag
+    (bag / "metadata.yaml").unlink()
+    storage = bag / f"{bag.name}.mcap"
+    storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
+    before = storage.read_bytes()
+    assert run_cli(monkeypatch, "recover", bag, "--out", tmp_path / "out") == 0
+    assert "was cut (the recorder did not finish it" in capsys.readouterr().out
+    assert storage.read_bytes() == before
+    whole, cut = read(tmp_path / "out" / bag.name), read(bag, partial=True)
+    count = cut.time.size  # a partial reading leaves out a sample whose voltage was cut off
+    assert 0 < count <= whole.time.size <= count + 1
+    np.testing.assert_array_equal(whole.deflection[:count], cut.deflection)
 
 
 def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, capsys):

@@ -4,6 +4,7 @@
 import itertools
 import math
 import re
+import resource
 import signal
 import subprocess
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 import rclpy
 from ament_index_python.packages import get_package_prefix
+from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
@@ -23,6 +25,7 @@ from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import build, load
+from piezo_control.recording.reader import open_bag
 from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
@@ -352,6 +355,47 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
         messages = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
     assert messages == ["/deflection"] * 4
     assert (bag / "metadata.yaml").exists()
+
+
+def test_a_killed_recorder_loses_the_last_second_at_most(neighbour, tmp_path):
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as processes:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        deflection = neighbour.publisher("deflection")
+        numbers = itertools.count()
+        neighbour.node.create_timer(0.01, lambda: deflection.publish(sample(next(numbers), 1e-6)))
+        neighbour.wait(lambda: states and sum(states[-1].recorded) > 20)
+        sent, begin = sum(states[-1].recorded), time.monotonic()
+        neighbour.wait(lambda: time.monotonic() - begin > 1.0)
+        processes.running["recorder"].kill()
+    left = open_bag(bag)
+    assert "did not finish" in left.damage
+    assert len(left.topics["/deflection"].data) >= sent
+
+
+def test_a_full_disk_is_named_and_what_was_written_stays(neighbour, tmp_path):
+    """The limit of a file's size stands for the end of the disk: the same error at the same call."""
+    bag = tmp_path / "bag"
+    process = subprocess.Popen(
+        [EXECUTABLES / "recorder", "--ros-args", "-p", f"bag:={bag}"],
+        stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+    )  # fmt: skip
+    try:
+        words = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
+        deflection = neighbour.publisher("deflection")
+        numbers = itertools.count()
+        neighbour.node.create_timer(0.002, lambda: deflection.publish(sample(next(numbers), 1e-6)))
+        neighbour.wait(
+            lambda: any("recording ended" in s.message for m in words for s in m.status), 60.0
+        )
+        assert process.poll() is None  # it goes on answering
+    finally:
+        process.terminate()
+        _, log = process.communicate(timeout=TIMEOUT)
+    assert process.returncode == 0
+    assert "File too large" in log and "experiment recover" in log and "Traceback" not in log
+    assert len(open_bag(bag).topics["/deflection"].data) > 0
 
 
 def test_recorder_refuses_an_existing_folder(neighbour, tmp_path):

@@ -82,6 +82,8 @@ class FeedbackNode(BlockNode):
             return
         before, after = flatten(self.parameters), flatten(parameters)
         changed = {name for name in DESIGN if before[name] != after[name]}
+        if parameters.controller == self.parameters.controller == "none":
+            changed = set()  # no controller, so no half of one
         if changed and not self._loading and "name" not in changed:
             raise ParameterError(
                 f"{', '.join(sorted(changed))}: part of a controller, which changes as a whole, with its "

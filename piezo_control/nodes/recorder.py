@@ -30,6 +30,7 @@ from piezo_control.nodes.parameters import RecorderParameters
 from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.recording.recording import PROFILE_TYPE, SAMPLE_TYPE, TEMPERATURE_TYPE
 from piezo_control.recording.writer import BagWriter
+from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import RecorderState
 
 FINGER = {
@@ -45,6 +46,7 @@ FINGER = {
 }
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
 STATE_PERIOD = 0.05  # s
+FLUSH_PERIOD = 0.5  # s
 
 
 class Track:
@@ -55,7 +57,8 @@ class Track:
         self.has_header = has_header
         self.is_numbered = connection.msgtype == SAMPLE_TYPE and topic not in SET_POINTS
         self.is_stamped = connection.msgtype == TEMPERATURE_TYPE
-        self.last = -1
+        self.sequence = Sequence(gaps=True)
+        self.last_stamp = -1
         self.recorded = 0
         self.duplicates = 0
         self.missing = 0
@@ -74,7 +77,9 @@ class RecorderNode(FingerNode):
     def __init__(self) -> None:
         super().__init__()
         self.states = self.create_publisher(RecorderState, "recorder_state", LATCHED)
-        self.create_timer(STATE_PERIOD, self._publish_state)
+        self.create_steady_timer(STATE_PERIOD, self._publish_state)
+        self.create_steady_timer(FLUSH_PERIOD, self._flush)
+        self.trouble = ""
         self.writer: BagWriter | None = None
         self.inputs: list[Any] = []
         self.latched: dict[str, bytes] = {}
@@ -113,12 +118,19 @@ class RecorderNode(FingerNode):
             connection = writer.add(self.resolve_topic_name(topic), name, latched)
             self.tracks[topic] = Track(topic, connection, writer.has_header(name))
         self.writer = writer
+        self.trouble = ""
         for topic, data in self.latched.items():
             self._write(topic, data)
 
     def stop(self) -> None:
         writer, self.writer = self.writer, None
-        writer.close()
+        if writer is None:
+            return  # given up before
+        try:
+            writer.close()
+        except OSError as error:
+            self._give_up(writer, error)
+            return
         counts = ", ".join(f"{topic} {t.recorded}" for topic, t in self.tracks.items())
         self.get_logger().info(f"wrote {writer.path}: {counts}")
 
@@ -156,25 +168,57 @@ class RecorderNode(FingerNode):
             stamp = self.get_clock().now().nanoseconds
         if track.is_numbered and not self._is_new(track, sample_number(data)):
             return
-        if track.is_stamped and stamp <= track.last:
+        if track.is_stamped and stamp <= track.last_stamp:
             track.duplicates += 1
             return
         if track.is_stamped:
-            track.last = stamp
-        self.writer.write(track.connection, stamp, data)
+            track.last_stamp = stamp
+        try:
+            self.writer.write(track.connection, stamp, data)
+        except OSError as error:
+            self._give_up(self.writer, error)
+            return
         track.recorded += 1
 
     def _is_new(self, track: Track, number: int) -> bool:
         """Count sample `number` of a topic and say whether it has not been written yet."""
-        if number == 0 and track.last > 0:
-            for other in self.tracks.values():
-                other.last = -1
-        if number <= track.last:
+        kind = track.sequence.classify(number)
+        if kind == STRAY and number >= track.sequence.next:
+            self.get_logger().error(
+                f"sample {number} after {track.sequence.next - 1} explains no loss; not recorded",
+                throttle_duration_sec=1.0,
+            )
+            return False
+        if kind in (REPEATED, STRAY):
             track.duplicates += 1
             return False
-        track.missing += number - track.last - 1
-        track.last = number
+        if kind == FIRST and track.sequence.next > 0:
+            for other in self.tracks.values():
+                other.sequence = Sequence(gaps=True)
+                other.last_stamp = -1
+        track.missing += number - max(track.sequence.next, 0)
+        track.sequence.count(number)
         return True
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        return self.trouble, {topic: track.recorded for topic, track in self.tracks.items()}
+
+    def _flush(self) -> None:
+        """Put on the disk what has come, so that a killed recorder loses no more than a second."""
+        if self.writer:
+            try:
+                self.writer.flush()
+            except OSError as error:
+                self._give_up(self.writer, error)
+
+    def _give_up(self, writer: BagWriter, error: OSError) -> None:
+        """End a recording that the disk does not take; what was written before stays readable."""
+        self.writer = None
+        self.trouble = f"'bag' {writer.path}: {error.strerror or error}: recording ended"
+        self.get_logger().error(
+            f"{self.trouble}; `experiment recover {writer.path}` makes a bag of what was written"
+        )
+        self.publish_diagnostics()
 
     def _publish_state(self) -> None:
         tracks = self.tracks

@@ -20,6 +20,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from piezo_control.profile import Profile
+from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import (
     LINEAR,
     PROFILE_TYPE,
@@ -69,6 +70,16 @@ class BagWriter:
         """Write one serialized message with the bag's time stamp (ns)."""
         self._writer.write(connection, stamp, data)
 
+    def flush(self) -> None:
+        """Give what was written to the disk, so that it outlives this process.
+
+        Raises OSError when the disk does not take it.
+        """
+        storage = self._writer.storage
+        if storage.chunk.msgs:
+            storage.close_chunk()
+        storage.bio.flush()
+
     def close(self) -> None:
         """Finish the folder."""
         self._writer.close()
@@ -77,6 +88,26 @@ class BagWriter:
         """Say whether messages of type `kind` begin with a std_msgs/Header."""
         fields = self.typestore.fielddefs[kind][1]
         return bool(fields) and fields[0][1][1] == "std_msgs/msg/Header"
+
+
+def recover(path: Path, to: Path) -> str:
+    """Write what can be read of the bag at `path` as a whole bag; return a sentence of what was found.
+
+    Raises BagError for what is no bag at all, ValueError when `to` exists.
+    """
+    found = open_bag(path)
+    bag = BagWriter(to)
+    bag.typestore = found.typestore
+    messages = []
+    for name, topic in found.topics.items():
+        connection = bag.add(name, topic.type, latched=topic.type == PROFILE_TYPE)
+        messages += [(stamp, connection, data) for stamp, data in zip(topic.stamps, topic.data)]
+    messages.sort(key=lambda message: message[0])
+    for stamp, connection, data in messages:
+        bag.write(connection, stamp, data)
+    bag.close()
+    condition = f"was cut ({found.damage})" if found.damage else "was whole"
+    return f"{path} {condition}: {found.content()} written to {to}"
 
 
 def write_recording(

@@ -7,6 +7,7 @@ Every figure is computed from the recorded bags; `analyse` and `compare` do the 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -49,10 +50,11 @@ def main() -> int:
     except (ParameterError, FileExistsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return UNUSABLE
-    except (RunFailed, BagError) as error:
+    except (RunFailed, BagError, OSError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return FAILED
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    if (out / "report.html").exists():
+        console.print(f"report: {out / 'report.html'}", soft_wrap=True)
     return DONE
 
 
@@ -61,7 +63,14 @@ def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -
     title, cases = read_experiment(arguments.command, overrides(arguments))
     for case in cases:
         case.parameters()  # refuse what cannot run before anything does
-    prepare(out, arguments.overwrite)
+    with results_folder(out, arguments.overwrite) as folder:
+        run_into(folder, arguments, title, cases, console)
+
+
+def run_into(
+    out: Path, arguments: argparse.Namespace, title: str, cases: Sequence[Case], console: Console
+) -> None:
+    """Run the cases and write what they give into the folder `out`."""
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
     )  # fmt: skip
@@ -103,9 +112,9 @@ def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> N
     from piezo_sim.experiment.bags import analyse_bags
 
     found = _read_bags(arguments)
-    prepare(out, overwrite=True)
-    sections = analyse_bags(found, arguments.kind, out)
-    write_html(out / "report.html", "Analysis of recorded bags", sections)
+    with results_folder(out, overwrite=True) as folder:
+        sections = analyse_bags(found, arguments.kind, folder)
+        write_html(folder / "report.html", "Analysis of recorded bags", sections)
     print_tables(console, sections)
 
 
@@ -114,10 +123,19 @@ def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> N
     from piezo_sim.experiment.bags import compare_bags
 
     found = _read_bags(arguments)
-    prepare(out, overwrite=True)
-    section = compare_bags(found, arguments.kind, out)
-    write_html(out / "report.html", "Comparison of recorded bags", [section])
+    with results_folder(out, overwrite=True) as folder:
+        section = compare_bags(found, arguments.kind, folder)
+        write_html(folder / "report.html", "Comparison of recorded bags", [section])
     print_tables(console, [section])
+
+
+def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+    """Make a whole bag of what can be read of a cut one."""
+    from piezo_control.recording.writer import recover
+
+    with results_folder(out, overwrite=False) as folder:
+        for path in arguments.bags:
+            console.print(recover(path, folder / path.name), soft_wrap=True)
 
 
 def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -147,6 +165,11 @@ def parser() -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
         command.set_defaults(run_command=function)
         _add_bag_options(command, name, least="two or more" if name == "compare" else "one or more")
+    text = "make whole bags, below --out, of what can be read of cut ones"
+    command = commands.add_parser("recover", help=text, description=f"{text.capitalize()}.")
+    command.set_defaults(run_command=run_recover)
+    command.add_argument("bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 folders")
+    command.add_argument("--out", type=Path, help="new folder for the bags (default: out/recover)")
     return main_parser
 
 
@@ -210,11 +233,25 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def prepare(out: Path, overwrite: bool) -> None:
-    """Make the folder `out`; raise FileExistsError if it has results that may not be replaced."""
-    if out.exists() and any(out.iterdir()):
-        if not overwrite:
-            raise FileExistsError(f"{out} is not empty; name a new --out or give --overwrite")
-        for old in ("bags", "log"):
-            shutil.rmtree(out / old, ignore_errors=True)
-    out.mkdir(parents=True, exist_ok=True)
+@contextlib.contextmanager
+def results_folder(out: Path, overwrite: bool) -> Iterator[Path]:
+    """Yield a folder beside `out` for results, which take their place in `out` when all went well.
+
+    What is in `out` under other names stays. After a failure the folder is left as it is, for its logs.
+    Raises FileExistsError if `out` is a file, or holds something and may not be replaced.
+    """
+    if out.exists() and not out.is_dir():
+        raise FileExistsError(f"--out is {out}, which is a file; name a folder")
+    if out.exists() and any(out.iterdir()) and not overwrite:
+        raise FileExistsError(f"{out} is not empty; name a new --out or give --overwrite")
+    folder = out.with_name(f"{out.name}.unfinished")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    yield folder
+    out.mkdir(exist_ok=True)
+    for made in folder.iterdir():
+        replaced = out / made.name
+        if replaced.is_dir():
+            shutil.rmtree(replaced)
+        made.replace(replaced)
+    folder.rmdir()

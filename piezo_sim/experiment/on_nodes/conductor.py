@@ -74,11 +74,6 @@ class Conductor:
         """Wait until the services of every node answer and the finger's state is heard."""
         for (name, service), client in self._clients.items():
             self.wait(client.service_is_ready, SERVICE_TIMEOUT, f"service {name}/{service}")
-        for topic, publisher in self._profiles.items():
-            self.wait(
-                lambda p=publisher: p.get_subscription_count() > 0, SERVICE_TIMEOUT,
-                f"subscriber of {topic}_profile",
-            )  # fmt: skip
 
     def configure(self, parameters: Mapping[str, Any]) -> None:
         """Bring every node to 'inactive' with these parameter dataclasses, one per node.
@@ -119,11 +114,19 @@ class Conductor:
             self._transition([name], Transition.TRANSITION_DEACTIVATE, "deactivate")
 
     def publish(self, topic: str, profile: Profile) -> None:
-        """Send a profile ahead ('reference' or 'tip_force') and wait until its readers have it."""
+        """Send a profile ahead ('reference' or 'tip_force') and wait until its readers have it.
+
+        These are a node of the loop and the recorder, both configured before.
+        """
+        publisher = self._profiles[topic]
+        self.wait(
+            lambda: publisher.get_subscription_count() >= 2, SERVICE_TIMEOUT,
+            f"a node and the recorder as subscribers of {topic}_profile",
+        )  # fmt: skip
         message = ProfileMessage(time=profile.time.tolist(), value=profile.value.tolist())
         message.interpolation = ProfileMessage.LINEAR if profile.linear else ProfileMessage.HOLD
-        self._profiles[topic].publish(message)
-        self._profiles[topic].wait_for_all_acked()
+        publisher.publish(message)
+        publisher.wait_for_all_acked()
 
     def _transition(self, names: Iterable[str], transition: int, verb: str) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))

@@ -118,4 +118,7 @@ def is_complete(conductor: Conductor, samples: int) -> bool:
     for topic in loop:
         if missing.get(topic):
             raise RunFailed(f"node 'recorder' missed {missing[topic]} samples of '{topic}'")
-    return all(recorded.get(topic) == samples for topic in loop)
+    profiles = ("reference_profile", "tip_force_profile")
+    return all(recorded.get(topic) == samples for topic in loop) and all(
+        map(recorded.get, profiles)
+    )
