@@ -70,9 +70,16 @@ def propagator(inertia: float, damping: float, stiffness: float, time: float) ->
     return Propagator(even + decay * odd, odd, -square * odd, even - decay * odd)
 
 
-def move(motion, free: Propagator, target: float) -> None:
-    """Advance `motion` = [x, v] (m, m/s) by one step towards the static `target` (m)."""
-    x = motion[0] - target
-    v = motion[1]
-    motion[0] = target + (free.xx * x + free.xv * v)
-    motion[1] = free.vx * x + free.vv * v
+class Motion(NamedTuple):
+    """Position (m) and speed (m/s) behind D(s), changed in place: lists of one (or float64 arrays)."""
+
+    x: list[float]
+    v: list[float]
+
+
+def move(motion: Motion, free: Propagator, target: float) -> None:
+    """Advance `motion` by one step towards the static `target` (m)."""
+    x = motion.x[0] - target
+    v = motion.v[0]
+    motion.x[0] = target + (free.xx * x + free.xv * v)
+    motion.v[0] = free.vx * x + free.vv * v

@@ -186,7 +186,7 @@ class Feedback:
     def __init__(self, parameters: FeedbackParameters) -> None:
         self.parameters = parameters
         self._coefficients = feedback_coefficients(parameters)
-        self._state = FeedbackState([0.0] * parameters.order, [0.0] * parameters.order)
+        self.state = FeedbackState([0.0] * parameters.order, [0.0] * parameters.order)
 
     def step(self, reference: float, deflection: float) -> float:
         """Return the command in m for one sample of reference and deflection in m.
@@ -197,11 +197,11 @@ class Feedback:
             raise ValueError(
                 f"reference {reference!r} m and deflection {deflection!r} m must be finite"
             )
-        return feedback_step(self._coefficients, self._state, reference, deflection)
+        return feedback_step(self._coefficients, self.state, reference, deflection)
 
     def reset(self) -> None:
         """Put all states to zero: at rest with zero error and zero command."""
-        self.restore([0.0] * self.parameters.order)
+        self.state.x[:] = [0.0] * self.parameters.order
 
     def start(self, reference: float, deflection: float, command: float) -> None:
         """Choose the states so that the next step returns `command` (all in m): no bump.
@@ -226,21 +226,8 @@ class Feedback:
         held = command - p.d * (reference - deflection) - p.reference_d * reference
         right = np.append(p.matrix("reference_b") * reference, held)
         try:
-            self.restore(np.linalg.solve(system, right)[:n].tolist())
+            self.state.x[:] = np.linalg.solve(system, right)[:n].tolist()
         except np.linalg.LinAlgError:
             raise ValueError(
                 f"controller '{p.name}' cannot hold a constant command: it has a zero at z = 1"
             ) from None
-
-    def snapshot(self) -> list[float]:
-        """Return a copy of the states."""
-        return list(self._state.x)
-
-    def restore(self, snapshot: Sequence[float]) -> None:
-        """Take over states from :meth:`snapshot` of the same controller."""
-        if len(snapshot) != self.parameters.order:
-            raise ValueError(
-                f"snapshot has {len(snapshot)} states, "
-                f"controller '{self.parameters.name}' has {self.parameters.order}"
-            )
-        self._state.x[:] = snapshot

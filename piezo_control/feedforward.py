@@ -10,7 +10,6 @@ applied, so the inverse is exact again at the first sample that needs no limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,7 +60,7 @@ class FeedforwardState(NamedTuple):
     """What :func:`feedforward_step` remembers, changed in place."""
 
     hysteresis: State
-    clipped: Sequence[float]  # one number: samples at which a limit acted
+    clipped: list[float]  # number of samples at which a limit acted
 
 
 def feedforward_step(
@@ -76,7 +75,7 @@ def feedforward_step(
         wanted = inverse_voltage(c.inverse, s.hysteresis, command)
     else:
         wanted = command / c.static_gain
-    voltage = limited(c.low, c.high, c.step_limit * share, s.hysteresis.drive[0], wanted)
+    voltage = limited(c.low, c.high, c.step_limit * share, s.hysteresis.voltage[0], wanted)
     if voltage != wanted:
         s.clipped[0] += 1.0
     if not c.inverting:
@@ -112,7 +111,7 @@ class Feedforward:
     def reset(self) -> None:
         """Forget everything: a homed finger at the voltage nearest to 0 V, no clipped sample."""
         plays = [0.0] * len(self.coefficients.operator.weights)
-        self.state = FeedforwardState(State(plays, [0.0, 0.0]), [0.0])
+        self.state = FeedforwardState(State(plays, voltage=[0.0], voltage_step=[0.0]), [0.0])
         rest = min(max(0.0, self.coefficients.low), self.coefficients.high)
         if rest:
             self.follow(rest)
@@ -139,7 +138,7 @@ class Feedforward:
     @property
     def voltage(self) -> float:
         """The last voltage (V)."""
-        return self.state.hysteresis.drive[0]
+        return self.state.hysteresis.voltage[0]
 
     @property
     def clipped(self) -> int:

@@ -30,6 +30,7 @@ Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -125,10 +126,15 @@ class Coefficients(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the step functions remember, changed in place: lists (or float64 arrays)."""
+    """What the step functions remember, changed in place: lists (or float64 arrays).
+
+    A single number that changes is a list of one: that is what plain Python and compiled code can both
+    change in place.
+    """
 
     plays: list[float]  # z_i of the operator (V) or z'_i of the inverse (m)
-    drive: list[float]  # last voltage (V) and size of the last voltage step (V)
+    voltage: list[float]  # the last voltage (V)
+    voltage_step: list[float]  # size of the last voltage step (V)
 
 
 def coefficients(parameters: HysteresisParameters, sample_time: float) -> Coefficients:
@@ -192,7 +198,7 @@ def _invert_side(
 def plays_output(c: Coefficients, s: State, value: float) -> float:
     """Return sum w_i z_i for the next input `value`, leaving the plays where they are."""
     thresholds, weights, plays = c.thresholds, c.weights, s.plays
-    growth = c.dilation * s.drive[1]
+    growth = c.dilation * s.voltage_step[0]
     total = weights[0] * value
     for i in range(1, len(weights)):
         threshold = thresholds[i] + growth
@@ -208,7 +214,7 @@ def plays_output(c: Coefficients, s: State, value: float) -> float:
 def plays_move(c: Coefficients, s: State, value: float) -> float:
     """Move the plays to the input `value` and return sum w_i z_i."""
     thresholds, weights, plays = c.thresholds, c.weights, s.plays
-    growth = c.dilation * s.drive[1]
+    growth = c.dilation * s.voltage_step[0]
     plays[0] = value
     total = weights[0] * value
     for i in range(1, len(weights)):
@@ -252,8 +258,8 @@ def dead_zones(c: Coefficients, value: float) -> float:
 
 def remember_voltage(s: State, voltage: float) -> None:
     """Take note of the voltage applied; the next sample's thresholds follow its step."""
-    s.drive[1] = abs(voltage - s.drive[0])
-    s.drive[0] = voltage
+    s.voltage_step[0] = abs(voltage - s.voltage[0])
+    s.voltage[0] = voltage
 
 
 def operator_step(operator: Coefficients, s: State, voltage: float) -> float:
@@ -315,27 +321,7 @@ def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:
             )
 
 
-class _Memory:
-    """The state of plays and its restoration, common to operator and inverse."""
-
-    def __init__(self, state: State) -> None:
-        self.state = state
-        self._initial = self.snapshot()
-
-    def snapshot(self) -> State:
-        """Return a copy of the state, for :meth:`restore`."""
-        return State(list(self.state.plays), list(self.state.drive))
-
-    def restore(self, snapshot: State) -> None:
-        """Go back to the state of a snapshot."""
-        self.state = State(list(snapshot.plays), list(snapshot.drive))
-
-    def reset(self) -> None:
-        """Go back to the initial state."""
-        self.restore(self._initial)
-
-
-class Hysteresis(_Memory):
+class Hysteresis:
     """Operator of one actuator; `step` takes one voltage, a call takes a history of them.
 
     Parameters
@@ -369,7 +355,7 @@ class Hysteresis(_Memory):
         if plays is None:
             plays = [0.0] * len(parameters.thresholds)
         check_plays(parameters.thresholds, plays)
-        super().__init__(State(list(plays), [plays[0], 0.0]))
+        self.state = State(list(plays), [plays[0]], [0.0])
 
     def step(self, voltage: float) -> float:
         """Apply one `voltage` (V) and return the deflection (m)."""
@@ -381,17 +367,17 @@ class Hysteresis(_Memory):
 
     def inverse(self) -> InverseHysteresis:
         """Return the inverse that compensates this actuator from its present state on."""
-        return InverseHysteresis(self.coefficients, self.snapshot())
+        return InverseHysteresis(self.coefficients, copy.deepcopy(self.state))
 
 
-class InverseHysteresis(_Memory):
+class InverseHysteresis:
     """Analytic inverse of an actuator with the coefficients `operator`, in the state `actuator`."""
 
     def __init__(self, operator: Coefficients, actuator: State) -> None:
         self.operator = operator
         self.coefficients = invert(operator)
         map_plays(operator, actuator)
-        super().__init__(actuator)
+        self.state = actuator
 
     def step(self, deflection: float) -> float:
         """Return the voltage (V) that leads the actuator to `deflection` (m)."""
@@ -409,7 +395,7 @@ class InverseHysteresis(_Memory):
 
     def actuator_plays(self) -> list[float]:
         """Return the states z_i (V) of the actuator this inverse belongs to."""
-        actuator = self.snapshot()
+        actuator = copy.deepcopy(self.state)
         map_plays(self.coefficients, actuator)
         return actuator.plays
 

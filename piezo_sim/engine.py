@@ -11,7 +11,6 @@ as Python, slowly.
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -37,9 +36,7 @@ from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording
 from piezo_control.safety import VoltageParameters
-from piezo_sim.plant import (
-    cantilever,
-)
+from piezo_sim.plant import cantilever
 from piezo_sim.plant.cantilever import (
     CantileverModel,
     CantileverParameters,
@@ -150,7 +147,7 @@ def run(
             dropouts.random(last - first),
         )
         loop(finger, inputs, first, every, outputs)
-    amplifier_clips = finger.plant_state.amplifier[1]
+    amplifier_clips = finger.plant_state.amplifier.clipped[0]
     return Run(
         number=np.arange(0, samples, every),
         time=time[::every],
@@ -205,11 +202,6 @@ def finger_at_rest(
     )
 
 
-def copy_finger(finger: Finger) -> Finger:
-    """Return a copy that shares no array with `finger`."""
-    return copy.deepcopy(finger)
-
-
 def _arrays(tree: Any) -> Any:
     """Return nested named tuples with every list turned into a float64 array."""
     if isinstance(tree, tuple):
@@ -223,7 +215,7 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
     state = finger.plant_state
     for n in range(len(inputs.reference)):
         look(plant, state, inputs.normal[n], inputs.uniform[n])
-        deflection = state.sensor[0]
+        deflection = state.readings[0]
         command = feedback_step(
             finger.feedback, finger.feedback_state, inputs.reference[n], deflection
         )

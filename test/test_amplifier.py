@@ -5,13 +5,13 @@ import math
 
 import pytest
 
-from piezo_sim.plant.amplifier import AmplifierParameters, amplify, discretize
+from piezo_sim.plant.amplifier import AmplifierParameters, AmplifierState, amplify, discretize
 
 
 def respond(parameters, demands, sample_time=1e-4):
-    output = [0.0, 0.0]
+    state = AmplifierState([0.0], [0.0])
     amplifier = discretize(parameters, sample_time)
-    return [amplify(output, amplifier, demand) for demand in demands], int(output[1])
+    return [amplify(state, amplifier, demand) for demand in demands], int(state.clipped[0])
 
 
 def test_within_the_limits_the_ideal_amplifier_changes_nothing():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from piezo_control.parameters import ParameterError
-from piezo_sim.plant.bouc_wen import BoucWen, TruthParameters, follow
+from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
 
 MODEL = BoucWen(7e-7, 2.4e-7, 0.04, -0.01)
 
@@ -16,7 +16,7 @@ MODEL = BoucWen(7e-7, 2.4e-7, 0.04, -0.01)
 @pytest.mark.parametrize("beta, gamma", [(0.04, -0.01), (0.04, 0.01), (0.04, 0.04), (0.04, -0.04)])
 def test_steps_solve_the_differential_equation(beta, gamma):
     model = BoucWen(7e-7, 2.4e-7, beta, gamma)
-    state = [0.0, 0.0]
+    state = BoucWenState([0.0], [0.0])
     lag = 0.0
     start = 0.0
     for voltage in (40.0, -30.0, 10.0, 9.0, -40.0, 40.0):
@@ -27,7 +27,9 @@ def test_steps_solve_the_differential_equation(beta, gamma):
 
         distance = abs(voltage - start)
         lag = solve_ivp(law, (0, distance), [lag], rtol=1e-10, atol=1e-18).y[0, -1]
-        assert follow(state, model, voltage) == pytest.approx(7e-7 * voltage - lag, abs=1e-14)
+        assert bouc_wen_step(model, state, voltage) == pytest.approx(
+            7e-7 * voltage - lag, abs=1e-14
+        )
         start = voltage
 
 
@@ -36,20 +38,20 @@ def test_steps_solve_the_differential_equation(beta, gamma):
     st.integers(1, 50),
 )
 def test_how_finely_a_voltage_is_sampled_does_not_matter(voltages, parts):
-    coarse, fine = [0.0, 0.0], [0.0, 0.0]
+    coarse, fine = BoucWenState([0.0], [0.0]), BoucWenState([0.0], [0.0])
     for voltage in voltages:
-        follow(coarse, MODEL, voltage)
-        for step in np.linspace(fine[1], voltage, parts + 1)[1:]:
-            follow(fine, MODEL, float(step))
-    assert fine[0] == pytest.approx(coarse[0], abs=1e-17)
+        bouc_wen_step(MODEL, coarse, voltage)
+        for step in np.linspace(fine.voltage[0], voltage, parts + 1)[1:]:
+            bouc_wen_step(MODEL, fine, float(step))
+    assert fine.lag[0] == pytest.approx(coarse.lag[0], abs=1e-17)
 
 
 def test_default_loop_is_that_of_figure_5():
     p = TruthParameters()
     model = BoucWen(p.slope, p.alpha, p.beta, p.gamma)
-    state = [0.0, 0.0]
+    state = BoucWenState([0.0], [0.0])
     voltage = 40.0 * np.sin(2.0 * np.pi * np.arange(1200) / 400)
-    deflection = np.array([follow(state, model, v) for v in voltage])[800:]
+    deflection = np.array([bouc_wen_step(model, state, v) for v in voltage])[800:]
     stroke = np.ptp(deflection)
     assert np.max(deflection) == pytest.approx(22e-6, rel=0.02)
     assert np.min(deflection) == pytest.approx(-22e-6, rel=0.02)

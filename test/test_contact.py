@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from piezo_control.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters, Motion
 from piezo_sim.plant.contact import ContactParameters, contact_force, discretize, move_tip
 
 DYNAMICS = DynamicsParameters()
@@ -15,11 +15,11 @@ SOFTNESS = DYNAMICS.elastic_constant
 
 def simulate(contact, target, offset, samples, sample_time):
     tip = discretize(contact, DYNAMICS, sample_time)
-    motion = [0.0, 0.0]
+    motion = Motion([0.0], [0.0])
     path = []
     for _ in range(samples):
         move_tip(motion, tip, target, offset)
-        path.append(tuple(motion))
+        path.append((motion.x[0], motion.v[0]))
     return tip, np.array(path)
 
 

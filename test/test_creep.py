@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 
 from piezo_control.parameters import ParameterError
-from piezo_sim.plant.creep import CreepParameters, creep, logarithmic
+from piezo_sim.plant.creep import CreepParameters, creep_step, discretize, logarithmic
 
 
 @pytest.mark.parametrize("sample_time", [1e-3, 0.1, 5.0])
 def test_held_drive_gives_the_sum_of_exponentials(sample_time):
     times = np.array([2.0, 15.0, 110.0])
     shares = np.array([0.2, 0.3, 0.5])
-    retained = np.exp(-sample_time / times)
+    creep = discretize(1e-7, 1e-8, times, shares, sample_time)
     states = [0.0, 0.0, 0.0]
     for _ in range(round(10.0 / sample_time)):
-        total = creep(states, retained, shares * (1.0 - retained), 5e-6)
+        total = creep_step(creep, states, 25.0, 10.0)  # driven by (1e-7 + 10 * 1e-8) * 25 m
     expected = 5e-6 * np.sum(shares * (1.0 - np.exp(-10.0 / times)))
     assert total == pytest.approx(expected, rel=1e-10)
 

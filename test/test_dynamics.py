@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from piezo_control.dynamics import DynamicsParameters, move, propagator
+from piezo_control.dynamics import DynamicsParameters, Motion, move, propagator
 from piezo_control.parameters import ParameterError
 
 INERTIA, DAMPING, _ = DynamicsParameters().denominator
@@ -38,11 +38,11 @@ def test_two_steps_make_one(first, second, damping):
 def test_step_response_rings_at_667_hz_with_damping_0_017_and_ends_at_1():
     time = 1e-5
     free = propagator(INERTIA, DAMPING, 1.0, time)
-    motion = [0.0, 0.0]
+    motion = Motion([0.0], [0.0])
     response = []
     for _ in range(20000):
         move(motion, free, 1.0)
-        response.append(motion[0])
+        response.append(motion.x[0])
     response = np.array(response)
     peaks = np.flatnonzero((response[1:-1] > response[:-2]) & (response[1:-1] > response[2:])) + 1
     period = (peaks[20] - peaks[0]) * time / 20

@@ -5,17 +5,22 @@ import math
 
 import pytest
 
-from piezo_sim.plant.thermal import retention, warm
+from piezo_sim.plant.thermal import Body, ThermalParameters, discretize, warm
+
+
+def temperature_after(time_constant, sample_time, samples):
+    thermal = discretize(ThermalParameters(time_constant=time_constant), 7e-7, sample_time)
+    body = Body([22.0], [22.0])
+    for _ in range(samples):
+        warm(thermal, body, 32.0)
+    return body.degc[0]
 
 
 @pytest.mark.parametrize("samples", [1, 7, 3000])
 def test_after_one_time_constant_1_minus_1_over_e_is_reached(samples):
-    retained = retention(0.3, 0.3 / samples)
-    body = 22.0
-    for _ in range(samples):
-        body = warm(body, retained, 32.0)
+    body = temperature_after(0.3, 0.3 / samples, samples)
     assert body == pytest.approx(32.0 - 10.0 / math.e, abs=1e-9)
 
 
 def test_without_time_constant_it_follows_at_once():
-    assert warm(22.0, retention(0.0, 1e-4), 32.0) == 32.0
+    assert temperature_after(0.0, 1e-4, 1) == 32.0

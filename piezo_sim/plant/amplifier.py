@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Voltage amplifier: clip, slew rate, bandwidth.
 
-The demanded voltage is kept within the limits of voltage and slew, and smoothed by a first-order lag 1 / (1 + s / (2 pi bandwidth)). The output is constant within a sample.
+The demanded voltage is kept within the limits of voltage and slew, and smoothed by a first-order lag
+1 / (1 + s / (2 pi bandwidth)). The output is constant within a sample.
 """
 
 from __future__ import annotations
@@ -47,11 +48,18 @@ def discretize(parameters: AmplifierParameters, sample_time: float) -> Amplifier
     )
 
 
-def amplify(output, amplifier: Amplifier, demand: float) -> float:
-    """Return the applied voltage; `output` = [applied voltage, number of limited demands]."""
-    before = output[0]
+class AmplifierState(NamedTuple):
+    """What the amplifier remembers, changed in place: lists of one (or float64 arrays)."""
+
+    voltage: list[float]  # applied (V)
+    clipped: list[float]  # number of demands that a limit changed
+
+
+def amplify(state: AmplifierState, amplifier: Amplifier, demand: float) -> float:
+    """Return the applied voltage (V) for a demanded one (V)."""
+    before = state.voltage[0]
     followed = limited(amplifier.low, amplifier.high, amplifier.change, before, demand)
     if followed != demand:
-        output[1] += 1.0
-    output[0] = followed + amplifier.retained * (before - followed)
-    return output[0]
+        state.clipped[0] += 1.0
+    state.voltage[0] = followed + amplifier.retained * (before - followed)
+    return state.voltage[0]

@@ -73,13 +73,20 @@ class BoucWen(NamedTuple):
     gamma: float
 
 
-def follow(state, model: BoucWen, voltage: float) -> float:
-    """Move `state` = [lag (m), voltage (V)] to `voltage` and return the static deflection (m)."""
-    change = voltage - state[1]
+class BoucWenState(NamedTuple):
+    """What Bouc-Wen hysteresis remembers, changed in place: lists of one (or float64 arrays)."""
+
+    lag: list[float]  # m
+    voltage: list[float]  # V
+
+
+def bouc_wen_step(model: BoucWen, state: BoucWenState, voltage: float) -> float:
+    """Apply `voltage` (V) and return the static deflection (m)."""
+    change = voltage - state.voltage[0]
     if change != 0.0:
         direction = 1.0 if change > 0.0 else -1.0
         rest = abs(change)
-        lag = direction * state[0]
+        lag = direction * state.lag[0]
         shrinking = model.beta - model.gamma
         if lag < 0.0:
             # Rate alpha - shrinking lag: the lag of the other sign reaches 0 after this much voltage.
@@ -94,9 +101,9 @@ def follow(state, model: BoucWen, voltage: float) -> float:
                 rest -= free
         if rest > 0.0:
             lag = approach(lag, model.alpha, model.beta + model.gamma, rest)
-        state[0] = direction * lag
-        state[1] = voltage
-    return model.slope * voltage - state[0]
+        state.lag[0] = direction * lag
+        state.voltage[0] = voltage
+    return model.slope * voltage - state.lag[0]
 
 
 def approach(lag: float, alpha: float, rate: float, distance: float) -> float:

@@ -18,13 +18,12 @@ both; a sensor zeroed at 0 V behind a negative excursion explains 26 of the 30 �
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from piezo_control.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters, Motion
 from piezo_control.hysteresis import (
     Coefficients,
     HysteresisParameters,
@@ -34,12 +33,20 @@ from piezo_control.hysteresis import (
 )
 from piezo_control.parameters import group, parameter
 from piezo_sim.plant import amplifier, contact, creep, thermal
-from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, amplify
-from piezo_sim.plant.bouc_wen import BoucWen, TruthParameters, follow
+from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, AmplifierState, amplify
+from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
 from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip
-from piezo_sim.plant.creep import CreepParameters
+from piezo_sim.plant.creep import Creep, CreepParameters, creep_step
 from piezo_sim.plant.sensor import Sensor, SensorParameters, read
-from piezo_sim.plant.thermal import REFERENCE_DEGC, ThermalParameters, warm
+from piezo_sim.plant.thermal import (
+    REFERENCE_DEGC,
+    Body,
+    Thermal,
+    ThermalParameters,
+    heated,
+    thermal_deflection,
+    warm,
+)
 
 DRAWS_AT_ONCE = 4096
 
@@ -66,36 +73,29 @@ class CantileverParameters:
 
 
 class CantileverModel(NamedTuple):
-    """What one sample of the cantilever needs: numbers and lists (or float64 arrays)."""
+    """The terms of one sample of the cantilever, in their order."""
 
     amplifier: Amplifier
-    is_truth: bool
+    is_truth: bool  # which of the next two is H_s
     operator: Coefficients
     bouc_wen: BoucWen
-    slope: float  # deflection per volt without hysteresis, m/V
-    gain_per_degc: float
-    lag_per_degc: float
-    sensitivity: float
-    body_retained: float
-    creep_gain: float
-    creep_gain_per_degc: float
-    creep_retained: Sequence[float]
-    creep_released: Sequence[float]
+    thermal: Thermal
+    creep: Creep
     tip: Tip
     sensor: Sensor
 
 
 class CantileverState(NamedTuple):
-    """What the cantilever remembers, changed in place: lists (or float64 arrays)."""
+    """What the terms remember, changed in place: lists (or float64 arrays), of one where one number."""
 
-    amplifier: list[float]  # applied voltage (V), number of clipped demands
+    amplifier: AmplifierState
     hysteresis: State
-    bouc_wen: list[float]  # lag (m), voltage (V)
-    body: list[float]  # temperature now and at the start (°C)
+    bouc_wen: BoucWenState
+    body: Body
+    relaxations: list[float]  # m
+    motion: Motion
     tip_force: list[float]  # external and contact force (N)
-    creep: list[float]  # relaxations (m)
-    motion: list[float]  # x (m), v (m/s) behind D(s)
-    sensor: list[float]  # readings (m), the next to come out first
+    readings: list[float]  # m, the next to come out first
 
 
 def model(parameters: CantileverParameters) -> CantileverModel:
@@ -106,60 +106,59 @@ def model(parameters: CantileverParameters) -> CantileverModel:
     bouc_wen = BoucWen(p.truth.slope, p.truth.alpha, p.truth.beta, p.truth.gamma)
     is_truth = p.plant == "truth"
     if is_truth:
-        times, shares = creep.logarithmic(p.truth.creep_onset, p.truth.creep_last)
         slope = bouc_wen.slope
         per_neper = slope / math.log(10.0)
         gain = p.truth.creep_per_decade * per_neper
         gain_per_degc = p.truth.creep_per_decade_degc * per_neper
+        times, shares = creep.logarithmic(p.truth.creep_onset, p.truth.creep_last)
     else:
-        times, shares = np.array(p.creep.times), np.array(p.creep.shares)
         slope = sum(operator.weights)
         gain, gain_per_degc = p.creep.gain, p.creep.gain_per_degc
-    retained = np.exp(-h / times)
+        times, shares = np.array(p.creep.times), np.array(p.creep.shares)
     return CantileverModel(
-        amplifier.discretize(p.amplifier, h),
-        is_truth,
-        operator,
-        bouc_wen,
-        slope,
-        p.thermal.gain_per_degc,
-        p.thermal.lag_per_degc,
-        p.thermal.sensitivity,
-        thermal.retention(p.thermal.time_constant, h),
-        gain,
-        gain_per_degc,
-        retained.tolist(),
-        (shares * -np.expm1(-h / times)).tolist(),
-        contact.discretize(p.contact, p.dynamics, h),
-        Sensor(p.sensor.resolution, p.sensor.noise, p.sensor.dropout_rate),
+        amplifier=amplifier.discretize(p.amplifier, h),
+        is_truth=is_truth,
+        operator=operator,
+        bouc_wen=bouc_wen,
+        thermal=thermal.discretize(p.thermal, slope, h),
+        creep=creep.discretize(gain, gain_per_degc, times, shares, h),
+        tip=contact.discretize(p.contact, p.dynamics, h),
+        sensor=Sensor(p.sensor.resolution, p.sensor.noise, p.sensor.dropout_rate),
     )
 
 
 def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> CantileverState:
     """Return the state at rest at 0 V, in equilibrium with `temperature_degc`."""
     return CantileverState(
-        [0.0, 0.0],
-        State([0.0] * len(m.operator.weights), [0.0, 0.0]),
-        [0.0, 0.0],
-        [temperature_degc, temperature_degc],
-        [0.0],
-        [0.0] * len(m.creep_retained),
-        [0.0, 0.0],
-        [0.0] * (delay_samples + 1),
+        amplifier=AmplifierState(voltage=[0.0], clipped=[0.0]),
+        hysteresis=State([0.0] * len(m.operator.weights), voltage=[0.0], voltage_step=[0.0]),
+        bouc_wen=BoucWenState(lag=[0.0], voltage=[0.0]),
+        body=Body([temperature_degc], degc_at_start=[temperature_degc]),
+        relaxations=[0.0] * len(m.creep.retained),
+        motion=Motion(x=[0.0], v=[0.0]),
+        tip_force=[0.0],
+        readings=[0.0] * (delay_samples + 1),
     )
 
 
 def deflection_of(m: CantileverModel, s: CantileverState) -> float:
     """Return the true deflection (m) from the position at the start."""
-    total = s.motion[0] + m.sensitivity * (s.body[0] - s.body[1])
-    for i in range(len(s.creep)):
-        total += s.creep[i]
+    total = s.motion.x[0] + thermal_deflection(m.thermal, s.body)
+    for i in range(len(s.relaxations)):
+        total += s.relaxations[i]
     return total
 
 
 def look(m: CantileverModel, s: CantileverState, normal: float, uniform: float) -> None:
-    """Let the sensor take its reading of the present instant; s.sensor[0] is what comes out."""
-    read(s.sensor, m.sensor, deflection_of(m, s), normal, uniform)
+    """Let the sensor take its reading of the present instant; s.readings[0] is what comes out."""
+    read(s.readings, m.sensor, deflection_of(m, s), normal, uniform)
+
+
+def hysteresis_step(m: CantileverModel, s: CantileverState, voltage: float) -> float:
+    """Return H_s(U) (m) of the class of plant that was chosen."""
+    if m.is_truth:
+        return bouc_wen_step(m.bouc_wen, s.bouc_wen, voltage)
+    return operator_step(m.operator, s.hysteresis, voltage)
 
 
 def advance(
@@ -167,20 +166,14 @@ def advance(
 ) -> None:
     """Go from t_k to t_{k+1} with the demanded voltage (V), temperature (°C) and tip force (N)."""
     voltage = amplify(s.amplifier, m.amplifier, demand)
-    if m.is_truth:
-        static = follow(s.bouc_wen, m.bouc_wen, voltage)
-    else:
-        static = operator_step(m.operator, s.hysteresis, voltage)
-    warmth = s.body[0] - REFERENCE_DEGC
-    lag = m.slope * voltage - static
-    static = (1.0 + m.gain_per_degc * warmth) * (static - m.lag_per_degc * warmth * lag)
-
-    gain = max(0.0, m.creep_gain + m.creep_gain_per_degc * warmth)
-    crept = creep.creep(s.creep, m.creep_retained, m.creep_released, gain * voltage)
-    s.body[0] = warm(s.body[0], m.body_retained, temperature_degc)
-    offset = m.sensitivity * (s.body[0] - s.body[1]) + crept
-    move_tip(s.motion, m.tip, static + m.tip.elastic_constant * force, offset)
-    s.tip_force[0] = force + contact_force(m.tip, s.motion[0] + offset, s.motion[1])
+    warmth = s.body.degc[0] - REFERENCE_DEGC
+    actuated = heated(m.thermal, hysteresis_step(m, s, voltage), voltage, warmth)
+    elastic = m.tip.elastic_constant * force
+    crept = creep_step(m.creep, s.relaxations, voltage, warmth)
+    warm(m.thermal, s.body, temperature_degc)
+    drift = thermal_deflection(m.thermal, s.body) + crept
+    move_tip(s.motion, m.tip, actuated + elastic, drift)
+    s.tip_force[0] = force + contact_force(m.tip, s.motion.x[0] + drift, s.motion.v[0])
 
 
 class Cantilever:
@@ -204,7 +197,7 @@ class Cantilever:
 
     def measure(self) -> float:
         """Return the sensor's output at the present instant (m); asking again changes nothing."""
-        return self._state.sensor[0]
+        return self._state.readings[0]
 
     def advance(self, voltage: float, temperature_degc: float, tip_force: float = 0.0) -> None:
         """Go on by one sample with these inputs held: V, °C, N (external force on the tip).
@@ -223,7 +216,7 @@ class Cantilever:
                     f"{name} is {value} {unit} at sample {self.samples}, must be a finite number"
                 )
         if self.samples == 0:
-            self._state.body[:] = [temperature_degc, temperature_degc]
+            self._state.body.degc[0] = self._state.body.degc_at_start[0] = temperature_degc
         advance(self._model, self._state, voltage, temperature_degc, tip_force)
         self.samples += 1
         self._look()
@@ -236,7 +229,7 @@ class Cantilever:
     @property
     def voltage(self) -> float:
         """Voltage as applied by the amplifier (V)."""
-        return self._state.amplifier[0]
+        return self._state.amplifier.voltage[0]
 
     @property
     def tip_force(self) -> float:
@@ -246,12 +239,12 @@ class Cantilever:
     @property
     def body_degc(self) -> float:
         """Temperature of the cantilever's body (°C)."""
-        return self._state.body[0]
+        return self._state.body.degc[0]
 
     @property
     def clipped(self) -> int:
         """Number of samples whose demanded voltage the amplifier clipped."""
-        return int(self._state.amplifier[1])
+        return int(self._state.amplifier.clipped[0])
 
     def _look(self) -> None:
         draw = next(self._draws, None)

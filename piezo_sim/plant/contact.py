@@ -19,7 +19,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from piezo_control.dynamics import DynamicsParameters, Propagator, move, propagator
+from piezo_control.dynamics import DynamicsParameters, Motion, Propagator, move, propagator
 from piezo_control.parameters import parameter
 
 PART = 0.05
@@ -62,13 +62,13 @@ def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_
     if contact.stiffness > 0.0:
         parts = math.ceil(sample_time * math.sqrt(total_stiffness / inertia) / PART)
     return Tip(
-        parts,
-        propagator(inertia, damping, stiffness, sample_time / parts),
-        propagator(inertia, total_damping, total_stiffness, sample_time / parts),
-        contact.stiffness,
-        contact.damping,
-        contact.free_play,
-        softness,
+        parts=parts,
+        free=propagator(inertia, damping, stiffness, sample_time / parts),
+        touching=propagator(inertia, total_damping, total_stiffness, sample_time / parts),
+        stiffness=contact.stiffness,
+        damping=contact.damping,
+        free_play=contact.free_play,
+        elastic_constant=softness,
     )
 
 
@@ -79,15 +79,15 @@ def contact_force(tip: Tip, deflection: float, speed: float) -> float:
     return min(0.0, -tip.stiffness * (deflection - tip.free_play) - tip.damping * speed)
 
 
-def move_tip(motion, tip: Tip, target: float, offset: float) -> None:
-    """Advance `motion` = [x, v] by one sample.
+def move_tip(motion: Motion, tip: Tip, target: float, offset: float) -> None:
+    """Advance `motion` by one sample.
 
     `target` is H_s(U) + s_p F_external, `offset` is b = g(T) + Creep, both held within the sample (m).
     """
     compliance = tip.elastic_constant * tip.stiffness
     held = (target - compliance * (offset - tip.free_play)) / (1.0 + compliance)
     for _ in range(tip.parts):
-        if contact_force(tip, motion[0] + offset, motion[1]) < 0.0:
+        if contact_force(tip, motion.x[0] + offset, motion.v[0]) < 0.0:
             move(motion, tip.touching, held)
         else:
             move(motion, tip.free, target)

@@ -13,7 +13,9 @@ the paper gives two temperatures; outside 22 to 32 °C it is an extrapolation.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,13 +61,35 @@ def logarithmic(onset: float, last: float) -> tuple[np.ndarray, np.ndarray]:
     return times, math.log(ratio) * np.exp(-onset / times)
 
 
-def creep(states, retained, released, drive: float) -> float:
-    """Advance the relaxations by one sample and return their sum (m).
+class Creep(NamedTuple):
+    """Creep over one sample; the sequences have one entry for each relaxation."""
 
-    `retained` is exp(-h / times), `released` is share (1 - retained), `drive` is gain(T) U (m).
+    gain: float  # m/V at 22 °C
+    gain_per_degc: float  # m/(V °C)
+    retained: Sequence[float]  # exp(-h / times), the part of a relaxation that is left
+    released: Sequence[float]  # share (1 - retained)
+
+
+def discretize(
+    gain: float, gain_per_degc: float, times: np.ndarray, shares: np.ndarray, sample_time: float
+) -> Creep:
+    """Return creep with relaxation `times` (s) and `shares` for one sample time (s)."""
+    return Creep(
+        gain,
+        gain_per_degc,
+        retained=np.exp(-sample_time / times).tolist(),
+        released=(shares * -np.expm1(-sample_time / times)).tolist(),
+    )
+
+
+def creep_step(creep: Creep, relaxations: list[float], voltage: float, warmth: float) -> float:
+    """Advance the `relaxations` (m) by one sample and return their sum (m).
+
+    `voltage` (V) and `warmth`, the body's temperature above 22 °C, are held within the sample.
     """
+    drive = max(0.0, creep.gain + creep.gain_per_degc * warmth) * voltage
     total = 0.0
-    for i in range(len(states)):
-        states[i] = retained[i] * states[i] + released[i] * drive
-        total += states[i]
+    for i in range(len(relaxations)):
+        relaxations[i] = creep.retained[i] * relaxations[i] + creep.released[i] * drive
+        total += relaxations[i]
     return total

@@ -39,7 +39,9 @@ class Sensor(NamedTuple):
     dropout_rate: float
 
 
-def read(line, sensor: Sensor, deflection: float, normal: float, uniform: float) -> None:
+def read(
+    line: list[float], sensor: Sensor, deflection: float, normal: float, uniform: float
+) -> None:
     """Take a reading of `deflection` (m) into the delay line.
 
     line[0] is the reading that comes out now, line[-1] the newest. `normal` and `uniform` are this

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from piezo_control.parameters import parameter
 
@@ -41,11 +42,42 @@ class ThermalParameters:
     )
 
 
-def retention(time_constant: float, sample_time: float) -> float:
-    """Return the part of a first-order transient that is left after `sample_time`."""
-    return math.exp(-sample_time / time_constant) if time_constant > 0.0 else 0.0
+class Thermal(NamedTuple):
+    """Thermal effects over one sample."""
+
+    slope: float  # of the straight line that hysteresis departs from, m/V
+    gain_per_degc: float
+    lag_per_degc: float
+    sensitivity: float  # m/°C
+    retained: float  # part of the body's transient that is left
 
 
-def warm(body_degc: float, retained: float, temperature_degc: float) -> float:
-    """Return the body's temperature one sample later at a held surface temperature (°C)."""
-    return temperature_degc + retained * (body_degc - temperature_degc)
+class Body(NamedTuple):
+    """Temperature of the body (°C), changed in place: lists of one (or float64 arrays)."""
+
+    degc: list[float]
+    degc_at_start: list[float]
+
+
+def discretize(parameters: ThermalParameters, slope: float, sample_time: float) -> Thermal:
+    """Return the thermal effects for one sample time (s); `slope` (m/V) is that of the hysteresis."""
+    p = parameters
+    retained = math.exp(-sample_time / p.time_constant) if p.time_constant > 0.0 else 0.0
+    return Thermal(slope, p.gain_per_degc, p.lag_per_degc, p.sensitivity, retained)
+
+
+def heated(thermal: Thermal, deflection: float, voltage: float, warmth: float) -> float:
+    """Return H_s(U, theta) for the `deflection` H_s(U) (m) and `warmth` = theta - 22 °C."""
+    lag = thermal.slope * voltage - deflection
+    change = 1.0 + thermal.gain_per_degc * warmth
+    return change * (deflection - thermal.lag_per_degc * warmth * lag)
+
+
+def warm(thermal: Thermal, body: Body, surface_degc: float) -> None:
+    """Go on by one sample with the surface at `surface_degc` (°C)."""
+    body.degc[0] = surface_degc + thermal.retained * (body.degc[0] - surface_degc)
+
+
+def thermal_deflection(thermal: Thermal, body: Body) -> float:
+    """Return g (m)."""
+    return thermal.sensitivity * (body.degc[0] - body.degc_at_start[0])
