@@ -34,6 +34,7 @@ setup(
         "matplotlib",
         "mcap",  # no rosdep key: without it all works but the reading of MCAP bags
         "numpy",
+        "pandas",
         "pyyaml",
         "rich",
         "rosbags",

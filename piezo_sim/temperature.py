@@ -19,10 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from piezo_control.identification.table import UNITS, TableError, read_table
 from piezo_control.parameters import ParameterError, parameter
+from piezo_control.safety import HIGHEST_DEGC, LOWEST_DEGC
 
 PROFILES = ("constant", "step", "ramp", "sine", "spotlight", "random_walk", "replay")
-CSV_COLUMNS = ("time", "temperature")
 
 
 @dataclass(frozen=True)
@@ -146,7 +147,7 @@ def _recording(file: str, topic: str, changed: int) -> tuple[np.ndarray, np.ndar
     if path.is_dir():
         time, values = _read_bag(path, topic)
     else:
-        time, values = _read_csv(path)
+        time, values = _read_text(path)
     late = np.flatnonzero(np.diff(time) <= 0.0)
     if late.size:
         raise ParameterError(
@@ -156,31 +157,31 @@ def _recording(file: str, topic: str, changed: int) -> tuple[np.ndarray, np.ndar
     return time, values
 
 
-def _read_csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (s) and temperatures of a table; rows with an empty cell are left out."""
     try:
-        lines = path.read_text().splitlines()
-    except OSError as error:
-        raise ParameterError(f"{path}: cannot be read: {error}") from None
-    names = [name.strip() for name in lines[0].split(",")] if lines else []
-    for name in CSV_COLUMNS:
-        if name not in names:
-            raise ParameterError(f"{path}: column '{name}' is missing; it has {names}")
-    columns: tuple[list[float], ...] = ([], [])
-    for row, line in enumerate(lines[1:], start=1):
-        cells = line.split(",")
-        for name, column in zip(CSV_COLUMNS, columns):
-            try:
-                value = float(cells[names.index(name)])
-            except (ValueError, IndexError):
-                value = math.nan
-            if not math.isfinite(value):
-                raise ParameterError(
-                    f"{path}: column '{name}', row {row}: {line!r} has no finite number there"
+        table = read_table(path)
+        columns = []
+        for quantity, units in (("time", ("s", "ms", "min")), ("temperature", ("degc",))):
+            place = table.find(quantity, None, units)
+            if place is None:
+                raise TableError(
+                    f"{path}: column '{quantity}' is missing; it has {', '.join(table.headers)}"
                 )
-            column.append(value)
-    if not columns[0]:
+            columns.append(table.numbers(place[0]) * UNITS[place[1]])
+    except TableError as error:
+        raise ParameterError(str(error)) from None
+    time, values = columns
+    whole = ~np.isnan(time) & ~np.isnan(values)
+    if not whole.any():
         raise ParameterError(f"{path}: has no rows")
-    return np.array(columns[0]), np.array(columns[1])
+    wild = np.flatnonzero(~((values >= LOWEST_DEGC) & (values <= HIGHEST_DEGC)) & whole)
+    if wild.size:
+        raise ParameterError(
+            f"{path}: column 'temperature', row {table.rows[wild[0]]} is {values[wild[0]]:g}, must be within "
+            f"[{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C"
+        )
+    return time[whole], values[whole]
 
 
 def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:

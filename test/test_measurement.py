@@ -39,7 +39,7 @@ def write_bag(path, voltage, deflection, temperature=None, sample_time=1e-3, pre
                 nanoseconds = round(number * sample_time * 1e9)
                 at = header(stamp(*divmod(nanoseconds, 10**9)), "")
                 message = (
-                    store.types[kind](at, number, value)
+                    store.types[kind](at, number, value, sample_time, False)
                     if kind == SAMPLE
                     else store.types[kind](at, value, 0.0)
                 )
@@ -73,10 +73,16 @@ def test_text_without_names_but_numbers_and_sample_time(tmp_path):
 @pytest.mark.parametrize(
     ("replace", "message"),
     [
-        ({30: "0.28,nan,1.0,22"}, "column 'voltage', row 30 is nan"),
+        ({30: "0.28,nan,1.0,22"}, "column 'voltage', row 30 is 'nan', must be a finite number"),
         ({30: "0.28,1.0,inf,22"}, "column 'deflection', row 30 is inf"),
-        ({30: "0.28,1.0,much,22"}, "column 2, row 30 is 'much', must be a number"),
-        ({30: "0.28,1.0"}, "row 30 has 2 columns"),
+        (
+            {30: "0.28,1.0,much,22"},
+            "column 'deflection_um', row 30 is 'much', must be a finite number",
+        ),
+        (
+            {n: "0.28,1.0" for n in (30, 31)},
+            "2 of 80 rows have an empty cell .*, the first is row 30",
+        ),
         ({30: "0.20,1.0,1.0,22"}, "column 'time', row 30 is 0.2: not after 0.27"),
         ({1: "t,voltage,deflection_um,temperature"}, "no column for 'time' and no sample time"),
         ({1: "time,u,deflection_um,temperature"}, "no column for 'voltage'; the file has time, u,"),

@@ -59,6 +59,7 @@ ROSDEP_KEYS = {
     "python3-jinja2",
     "python3-matplotlib",
     "python3-numpy",
+    "python3-pandas",
     "python3-pytest",
     "python3-rich",
     "python3-rosbags-pip",

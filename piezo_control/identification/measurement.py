@@ -16,15 +16,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from piezo_control.identification.table import (
+    LARGEST_MISSING_SHARE,
+    UNITS,
+    TableError,
+    read_table,
+)
 from piezo_control.recording import recording
 
 SHORTEST = 50  # samples
-QUANTITIES = {  # the units a column may have, with what makes SI (degC for temperature) of them
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
-    "voltage": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
-    "deflection": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
-    "temperature": {"degc": 1.0},
-    "tip_force": {"N": 1.0, "mN": 1e-3, "uN": 1e-6},
+QUANTITIES = {  # the units a column may have, the first of them where nothing says which
+    "time": ("s", "ms", "us", "min"),
+    "voltage": ("V", "mV", "kV"),
+    "deflection": ("m", "mm", "um", "nm"),
+    "temperature": ("degc",),
+    "tip_force": ("N", "mN", "uN"),
 }
 
 
@@ -46,6 +52,7 @@ class Measurement:
     temperature: NDArray[np.float64] | None  # degC
     tip_force: NDArray[np.float64] | None  # N
     rows: NDArray[np.int64]
+    description: str = ""  # what was read, for people
 
     def __post_init__(self) -> None:
         if len(self.time) < SHORTEST:
@@ -112,7 +119,7 @@ def read_measurement(
     run: int | None = None,
     sensor_delay: int = 1,
 ) -> Measurement:
-    """Read a bag (`finger`, `run`, `sensor_delay`) or a text file (`columns`, `sample_time`).
+    """Read a bag (`finger`, `run`, `sensor_delay`) or a table (`columns`, `sample_time`).
 
     Raises MeasurementError, naming file, column and row, when it cannot be used.
     """
@@ -129,100 +136,51 @@ def is_bag(path: str | Path) -> bool:
 def read_text(
     path: str | Path, columns: Mapping[str, str], sample_time: float | None = None
 ) -> Measurement:
-    """Read a text file of numbers separated by commas, semicolons or white space.
+    """Read a table of numbers (:mod:`piezo_control.identification.table`).
 
     Parameters
     ----------
-    path : path of the file; lines that begin with '#' are ignored
+    path : path of the file
     columns : mapping
         Where to find a quantity: ``{"deflection": "4:um"}`` is column 4, counted from 0, in
-        micrometres; with a line of names, ``"probe:um"`` is the column of that name. A quantity not
-        mentioned is looked for under its own name, also with a unit behind it: ``deflection_um``.
+        micrometres; ``"probe:um"`` the column of that name, or the only one with 'probe' in its name. A
+        quantity not mentioned is looked for under its own name. A unit in the file need not be given.
     sample_time : float, optional
         Time between rows (s) of a file without time column.
+
+    Rows in which a cell that is needed is empty are left out, if they are few.
     """
     try:
-        lines = Path(path).read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise MeasurementError(f"{path}: cannot be read as text: {error}") from None
-    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
-    if not numbered:
-        raise MeasurementError(f"{path}: no rows")
-    first = numbered[0][1]
-    separator = next((c for c in ",;" if c in first), None)
-    names = [entry.strip() for entry in first.split(separator)]
-    has_names = not all(_is_number(name) for name in names)
-    if has_names:
-        numbered = numbered[1:]
-    else:
-        names = [str(index) for index in range(len(names))]
-    found = {q: _find(path, q, columns.get(q), names, has_names) for q in QUANTITIES}
-    for quantity in ("voltage", "deflection"):
-        if found[quantity] is None:
-            raise MeasurementError(
-                f"{path}: no column for '{quantity}'; the file has {', '.join(names)}"
-            )
-    if found["time"] is None and sample_time is None:
-        raise MeasurementError(f"{path}: no column for 'time' and no sample time given")
-    rows = np.array([n for n, _ in numbered])
-    values = {
-        quantity: None if place is None else place[1] * _column(path, numbered, separator, place[0])
-        for quantity, place in found.items()
-    }
-    if values["time"] is None:
-        values["time"] = sample_time * np.arange(len(rows))
-    return Measurement(str(path), rows=rows, **values)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _find(
-    path: str | Path, quantity: str, wanted: str | None, names: list[str], has_names: bool
-) -> tuple[int, float] | None:
-    """Return index and scale of the column of a quantity, None when there is none."""
-    units = QUANTITIES[quantity]
-    if wanted is None:
-        for unit, scale in units.items():
-            if f"{quantity}_{unit}" in names:
-                return names.index(f"{quantity}_{unit}"), scale
-        return (names.index(quantity), 1.0) if quantity in names else None
-    name, _, unit = wanted.partition(":")
-    unit = unit or next(iter(units))
-    if unit not in units:
+        table = read_table(path)
+        found = {q: table.find(q, columns.get(q), units) for q, units in QUANTITIES.items()}
+        for quantity in ("voltage", "deflection"):
+            if found[quantity] is None:
+                raise MeasurementError(
+                    f"{path}: no column for '{quantity}'; the file has {', '.join(table.headers)}"
+                )
+        if found["time"] is None and sample_time is None:
+            raise MeasurementError(f"{path}: no column for 'time' and no sample time given")
+        places = {quantity: place for quantity, place in found.items() if place}
+        values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
+    except TableError as error:
+        raise MeasurementError(str(error)) from None
+    if "time" not in values:
+        values["time"] = sample_time * np.arange(len(table.rows))
+    empty = np.any([np.isnan(column) for column in values.values()], axis=0)
+    if empty.mean() > LARGEST_MISSING_SHARE:
         raise MeasurementError(
-            f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
+            f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
+            f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
         )
-    if name not in names:
-        kind = "has" if has_names else "has no line of names; its columns are"
-        raise MeasurementError(
-            f"{path}: no column '{name}' for '{quantity}'; the file {kind} {', '.join(names)}"
-        )
-    return names.index(name), units[unit]
-
-
-def _column(
-    path: str | Path, numbered: list[tuple[int, str]], separator: str | None, index: int
-) -> NDArray[np.float64]:
-    values = np.empty(len(numbered))
-    for sample, (row, line) in enumerate(numbered):
-        entries = line.split(separator)
-        try:
-            values[sample] = float(entries[index])
-        except IndexError:
-            raise MeasurementError(
-                f"{path}: row {row} has {len(entries)} columns, needs column {index}"
-            ) from None
-        except ValueError:
-            raise MeasurementError(
-                f"{path}: column {index}, row {row} is '{entries[index]}', must be a number"
-            ) from None
-    return values
+    read = ", ".join(f"{q} = column '{table.headers[i]}' [{u}]" for q, (i, u) in places.items())
+    left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
+    columns_found = {q: values[q][~empty] if q in values else None for q in QUANTITIES}
+    return Measurement(
+        source=str(path),
+        rows=table.rows[~empty],
+        description=f"read {(~empty).sum():,} rows {table.form}: {read}{left_out}",
+        **columns_found,
+    )
 
 
 def read_bag(
@@ -261,6 +219,7 @@ def read_bag(
         since_sent(recorded.temperature),
         since_sent(recorded.tip_force, until_then=0.0),
         recorded.number,
+        f"read {recorded.number.size:,} samples of a bag, one every {recorded.sample_time:g} s",
     )
     measurement.need_even_sampling()
     return measurement

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of numbers as instruments and spreadsheets write them: what is a name, a unit, a number is found.
+
+Text in any usual encoding, separated by tabs, semicolons, commas or blanks, with decimal points or commas,
+quoted or not, with comments, a line of names and one of units or without; MATLAB (up to version 7), NumPy and
+Parquet files with one vector for each column.
+"""
+
+from __future__ import annotations
+
+import codecs
+import io
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+UNITS = {
+    "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0,
+    "V": 1.0, "mV": 1e-3, "kV": 1e3,
+    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9,
+    "N": 1.0, "mN": 1e-3, "uN": 1e-6,
+    "degc": 1.0,
+}  # fmt: skip
+"""Units that are understood, with what makes SI (°C for temperature) of them."""
+
+SPELLINGS = {"µ": "u", "μ": "u", "°C": "degc", "degC": "degc", "celsius": "degc", "sec": "s"}
+COMMENTS = ("#", "%")
+LARGEST_MISSING_SHARE = 0.01  # of the rows
+BINARY = {".mat", ".npz", ".parquet"}
+
+
+class TableError(ValueError):
+    """A table that cannot be read; the message names file, column and row."""
+
+
+def unit_of(text: str) -> str:
+    """Return the unit that `text` spells, '' when it is none."""
+    for spelling, plain in SPELLINGS.items():
+        text = text.replace(spelling, plain)
+    text = text.strip().strip("[]()")
+    return {"C": "degc", "volt": "V", "volts": "V", "seconds": "s"}.get(text, text) if text else ""
+
+
+def split_name(header: str) -> tuple[str, str]:
+    """Return name and unit of a heading: 'Voltage (V)', 'x [µm]', 'disp_nm', 'U / V', 'Temp., °C'."""
+    match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*", header) or re.fullmatch(
+        r"(.+?)\s*(?:[/,]\s*|_)([^\s_/,]+)\s*", header
+    )
+    if match and unit_of(match[2]) in UNITS:
+        return match[1].strip(), unit_of(match[2])
+    return header.strip(), ""
+
+
+@dataclass
+class Table:
+    """Columns of cells, still as the file has them; `rows` are the numbers of their lines."""
+
+    path: Path
+    headers: list[str]  # '0', '1', … for a file without a line of names
+    units: list[str]  # '' where the file says none
+    cells: pd.DataFrame
+    rows: NDArray[np.int64]
+    decimal: str = "."
+    form: str = ""
+
+    def find(
+        self, quantity: str, wanted: str | None, units: tuple[str, ...]
+    ) -> tuple[int, str] | None:
+        """Return index and unit of the column of a `quantity`, None when there is none.
+
+        `wanted` is NAME, NUMBER or a part of the name that only one column has, with ':UNIT' behind it where
+        the file does not say; without it the quantity is looked for under its own name. The first of
+        `units` holds where nothing says another one. Raises TableError for what is not there.
+        """
+        name, _, unit = (wanted or quantity).rpartition(":") if ":" in (wanted or "") else (
+            wanted or quantity, "", "",
+        )  # fmt: skip
+        if unit and unit_of(unit) not in units:
+            raise TableError(
+                f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
+            )
+        index = self._index(name, quantity, exact=wanted is None)
+        if index is None:
+            if wanted is None:
+                return None
+            raise TableError(
+                f"{self.path}: no column '{name}' for '{quantity}'; the file has "
+                f"{', '.join(self.headers)}"
+            )
+        unit = unit_of(unit) or self.units[index] or units[0]
+        if unit not in units:
+            raise TableError(
+                f"{self.path}: column '{self.headers[index]}' is in {unit}, '{quantity}' must be in one of "
+                f"{', '.join(units)}"
+            )
+        return index, unit
+
+    def _index(self, name: str, quantity: str, exact: bool) -> int | None:
+        def plain(text: str) -> str:
+            return re.sub(r"[\s_]+", " ", text).strip().lower()
+
+        bases = [split_name(header)[0] for header in self.headers]
+        for names in (self.headers, bases, list(map(plain, bases))):
+            sought = plain(name) if names is not self.headers and names is not bases else name
+            if names.count(sought) == 1:
+                return names.index(sought)
+        if exact:
+            return None
+        if name.isdigit() and int(name) < len(self.headers):
+            return int(name)
+        partial = [i for i, header in enumerate(self.headers) if plain(name) in plain(header)]
+        if len(partial) > 1:
+            raise TableError(
+                f"{self.path}: '{name}' for '{quantity}' may be any of "
+                f"{', '.join(self.headers[i] for i in partial)}"
+            )
+        return partial[0] if partial else None
+
+    def numbers(self, index: int) -> NDArray[np.float64]:
+        """Return a column as numbers, NaN where a cell is empty; dates become seconds since the first.
+
+        Raises TableError for the first cell that is no number.
+        """
+        column = self.cells.iloc[:, index]
+        if column.dtype != object:
+            return column.to_numpy(dtype=float)
+        text = column.fillna("").str.strip()
+        values = pd.to_numeric(text.str.replace(self.decimal, "."), errors="coerce").to_numpy(float)
+        # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
+        unread = np.isnan(values) & (text != "").to_numpy()
+        if unread.size and unread.all():
+            dates = pd.to_datetime(text, errors="coerce", format="mixed")
+            if dates.notna().all():
+                return (dates - dates.iloc[0]).dt.total_seconds().to_numpy(float)
+        if unread.any():
+            row = int(np.flatnonzero(unread)[0])
+            raise TableError(
+                f"{self.path}: column '{self.headers[index]}', row {self.rows[row]} is "
+                f"'{text.iloc[row]}', must be a finite number"
+            )
+        return values
+
+
+def read_table(path: str | Path) -> Table:
+    """Read a table of numbers; raises TableError naming what cannot be read."""
+    path = Path(path)
+    if path.suffix.lower() in BINARY:
+        return _read_arrays(path)
+    try:
+        text = _decode(path.read_bytes())
+    except (OSError, UnicodeDecodeError) as error:
+        raise TableError(f"{path}: cannot be read as text: {error}") from None
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith(COMMENTS)
+    ]
+    if not lines:
+        raise TableError(f"{path}: no rows")
+    separator, decimal = _separator([line for _, line in lines])
+    try:
+        cells = pd.read_csv(
+            io.StringIO("\n".join(line for _, line in lines)),
+            sep=separator, header=None, dtype=str, skipinitialspace=True,
+            keep_default_na=False, na_values=[""],
+        )  # fmt: skip
+    except (pd.errors.ParserError, ValueError) as error:
+        raise TableError(f"{path}: {str(error).splitlines()[0]}") from None
+    rows = np.array([number for number, _ in lines])
+    headers, units, first = _headings(cells, decimal)
+    spelled = {"\t": "tabs", r"\s+": "blanks"}.get(separator, f"'{separator}'")
+    form = f"separated by {spelled}" + (", decimal commas" if decimal == "," else "")
+    return Table(path, headers, units, cells.iloc[first:], rows[first:], decimal, form)
+
+
+def _decode(data: bytes) -> str:
+    """Return the text of a file by its byte-order mark, as UTF-8, or as the Windows of a lab."""
+    for mark, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                       (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
+        if data.startswith(mark):
+            return data.decode(name)
+    if b"\0" in data:
+        raise UnicodeDecodeError(
+            "utf-8", data, data.index(b"\0"), data.index(b"\0") + 1, "binary data"
+        )
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252")
+
+
+def _separator(lines: list[str]) -> tuple[str, str]:
+    """Return separator and decimal mark, judged by the last line, which has numbers."""
+    last = lines[-1]
+    for separator in ("\t", ";"):
+        if separator in last:
+            return separator, "," if re.search(r"\d,\d", last) and "." not in last else "."
+    if "," not in last:
+        return r"\s+", "."
+    # Commas separate, unless blanks do and the commas are within numbers.
+    entries = last.split()
+    if len(entries) > 1 and all(re.fullmatch(r'"?[-+\d.,eE]+"?', e) for e in entries):
+        if not any(e.endswith(",") for e in entries):
+            return r"\s+", ","
+    return ",", "."
+
+
+def _headings(cells: pd.DataFrame, decimal: str) -> tuple[list[str], list[str], int]:
+    """Return headings, units, and the index of the first row of numbers."""
+
+    def words(row: int) -> list[str]:
+        return cells.iloc[row].fillna("").str.strip().tolist()
+
+    def are_words(entries: list[str]) -> bool:
+        numbers = pd.to_numeric(pd.Series(entries).str.replace(decimal, "."), errors="coerce")
+        given = [entry != "" for entry in entries]
+        return not numbers[given].notna().any()
+
+    first = words(0)
+    if not are_words(first) or _is_date(first[0]):
+        return [str(i) for i in range(len(first))], [""] * len(first), 0
+    units = [split_name(header)[1] for header in first]
+    if len(cells) > 1:
+        second = words(1)
+        if are_words(second) and not _is_date(second[0]):
+            found = [unit_of(entry) for entry in second]
+            return first, [u if u in UNITS else unit for u, unit in zip(found, units)], 2
+    return first, units, 1
+
+
+def _is_date(text: str) -> bool:
+    return bool(re.match(r"\d+[-/.:]\d+", text))
+
+
+def _read_arrays(path: Path) -> Table:
+    """Read vectors by name: MATLAB, NPZ, Parquet."""
+    try:
+        arrays = _load_arrays(path)
+    except (OSError, ValueError, NotImplementedError, ImportError) as error:
+        hint = "; save it with '-v7'" if isinstance(error, NotImplementedError) else ""
+        raise TableError(f"{path}: cannot be read: {error}{hint}") from None
+    vectors = {
+        name: np.ravel(values).astype(float)
+        for name, values in arrays.items()
+        if np.ndim(values) and np.issubdtype(np.asarray(values).dtype, np.number)
+    }
+    length = max((v.size for v in vectors.values()), default=0)
+    vectors = {name: v for name, v in vectors.items() if v.size == length}
+    if not length:
+        raise TableError(f"{path}: no vectors of numbers; it has {', '.join(arrays)}")
+    headers = list(vectors)
+    units = [split_name(header)[1] for header in headers]
+    return Table(
+        path, headers, units, pd.DataFrame(vectors), np.arange(length), form="vectors by name"
+    )
+
+
+def _load_arrays(path: Path) -> Mapping[str, Any]:
+    if path.suffix.lower() == ".mat":
+        from scipy.io import loadmat
+
+        return {n: v for n, v in loadmat(path).items() if not n.startswith("__")}
+    if path.suffix.lower() == ".npz":
+        with np.load(path, allow_pickle=False) as arrays:
+            return dict(arrays)
+    return {name: column.to_numpy() for name, column in pd.read_parquet(path).items()}
