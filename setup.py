@@ -42,6 +42,7 @@ setup(
         "setuptools",
     ],
     extras_require={
+        "cluster": ["distributed"],  # `monte_carlo --scheduler`
         "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
         "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
         "test": ["coverage", "hypothesis", "mypy", "pytest", "ruff", "types-PyYAML"],
@@ -59,6 +60,7 @@ setup(
             "identify = piezo_control.identification.cli:main",
             "synthesize = piezo_control.design.cli:main",
             "gripper = piezo_control.nodes.gripper:main",
+            "monte_carlo = piezo_sim.experiment.monte_carlo:main",
         ],
     },
 )

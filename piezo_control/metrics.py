@@ -7,39 +7,39 @@ relative figures are fractions (0.05 is 5 %) of the step, that is of the change 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 
 class StepMetrics(NamedTuple):
-    """Figures of a step response, see :func:`step_metrics`."""
+    """Figures of a step response, or arrays of them, see :func:`step_metrics`."""
 
-    settling_5_reference_s: float
-    settling_2_reference_s: float
-    settling_5_final_s: float
-    settling_2_final_s: float
-    rise_s: float
-    overshoot: float
-    static_error: float
-    final: float
+    settling_5_reference_s: Any
+    settling_2_reference_s: Any
+    settling_5_final_s: Any
+    settling_2_final_s: Any
+    rise_s: Any
+    overshoot: Any
+    static_error: Any
+    final: Any
 
 
-def settling_time(time: ArrayLike, value: ArrayLike, target: float, band: float) -> float:
+def settling_time(time: ArrayLike, value: ArrayLike, target: ArrayLike, band: ArrayLike) -> Any:
     """Return the time from time[0] after which ``|value - target| <= band`` for good, in s.
 
     It is the instant of the first sample from which on all samples are inside the band; infinite
-    when the last sample is outside. `time` and `value` are 1-D arrays with shape (nsamples,), `band`
-    and `target` have the unit of `value`.
+    when the last sample is outside. `time` is a 1-D array with shape (nsamples,), `value` one with shape
+    (..., nsamples), `target` and `band`, in the unit of `value`, and the result have shape (...).
     """
     time = np.asarray(time, dtype=float)
-    outside = np.flatnonzero(~(np.abs(np.asarray(value, dtype=float) - target) <= band))
-    if outside.size == 0:
-        return 0.0
-    if outside[-1] + 1 == time.size:
-        return float("inf")
-    return float(time[outside[-1] + 1] - time[0])
+    distance = np.abs(np.asarray(value, dtype=float) - np.expand_dims(target, -1))
+    outside = ~(distance <= np.expand_dims(band, -1))
+    settled = time.size - np.argmax(outside[..., ::-1], axis=-1)  # first sample inside for good
+    settled = np.where(outside.any(axis=-1), settled, 0)
+    late = outside[..., -1]
+    return np.where(late, np.inf, time[np.where(late, 0, settled)] - time[0])[()]
 
 
 def step_metrics(
@@ -50,7 +50,7 @@ def step_metrics(
     Parameters
     ----------
     time, value : array_like
-        1-D arrays with shape (nsamples,) in s and m; time[0] is the instant of the step.
+        Arrays with shape (nsamples,) in s and (..., nsamples) in m; time[0] is the instant of the step.
     reference, initial : float
         Value of the reference after and before the step, in m. Their difference is the step.
     tail : float
@@ -59,6 +59,8 @@ def step_metrics(
     Returns
     -------
     StepMetrics
+        of shape (...):
+
         * ``settling_5_reference_s``, ``settling_2_reference_s``: settling into 5 % and 2 % of the
           step around the **reference**, so a static error above the band never settles;
         * ``settling_5_final_s``, ``settling_2_final_s``: the same around the **final value**, the
@@ -76,14 +78,14 @@ def step_metrics(
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
     step = reference - initial
-    if time.shape != value.shape or time.ndim != 1 or time.size < 2:
+    if time.ndim != 1 or time.shape != value.shape[-1:] or time.size < 2:
         raise ValueError(
-            f"time {time.shape} and value {value.shape} must be equal 1-D shapes of 2 or more"
+            f"time {time.shape} must be 1-D, as long as the last axis of value {value.shape}, 2 or more"
         )
     if step == 0.0:
         raise ValueError("reference and initial are equal: there is no step")
     progress = (value - initial) / step
-    final = float(np.mean(progress[-max(1, round(tail * time.size)) :]))
+    final = np.mean(progress[..., -max(1, round(tail * time.size)) :], axis=-1)
     return StepMetrics(
         settling_5_reference_s=settling_time(time, progress, 1.0, 0.05),
         settling_2_reference_s=settling_time(time, progress, 1.0, 0.02),
@@ -91,22 +93,21 @@ def step_metrics(
         settling_2_final_s=settling_time(time, progress, final, 0.02 * abs(final)),
         rise_s=_first_crossing(time, progress, 0.9 * final)
         - _first_crossing(time, progress, 0.1 * final),
-        overshoot=max(0.0, float(np.max(progress)) - 1.0),
+        overshoot=np.maximum(0.0, np.max(progress, axis=-1) - 1.0),
         static_error=abs(1.0 - final),
         final=initial + step * final,
     )
 
 
-def _first_crossing(time: np.ndarray, value: np.ndarray, level: float) -> float:
-    above = np.flatnonzero(value * np.sign(level) >= abs(level))
-    if above.size == 0:
-        return float("inf")
-    i = above[0]
-    if i == 0:
-        return float(time[0])
-    return float(
-        time[i - 1] + (level - value[i - 1]) / (value[i] - value[i - 1]) * (time[i] - time[i - 1])
-    )
+def _first_crossing(time: np.ndarray, value: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Return when `value`, shape (..., nsamples), first reaches `level`, shape (...); infinite if never."""
+    above = value * np.sign(level)[..., None] >= abs(level)[..., None]
+    after = np.argmax(above, axis=-1)
+    before = np.maximum(after - 1, 0)
+    low, high = (np.take_along_axis(value, i[..., None], axis=-1)[..., 0] for i in (before, after))
+    rise = np.where(after > before, high - low, 1.0)
+    crossing = time[before] + (level - low) / rise * (time[after] - time[before])
+    return np.where(above.any(axis=-1), crossing, np.inf)
 
 
 class Ringing(NamedTuple):

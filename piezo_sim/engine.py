@@ -11,6 +11,7 @@ as Python, slowly.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -43,6 +44,7 @@ from piezo_sim.plant.cantilever import (
     CantileverState,
     advance,
     deflection_of,
+    deviating,
     look,
 )
 from piezo_sim.temperature import TemperatureParameters, grid_index, temperature
@@ -163,6 +165,54 @@ def run(
     )
 
 
+class Deviations(NamedTuple):
+    """Fingers that are not the nominal one: a factor for each finger, 1-D arrays of equal shape."""
+
+    resonance: np.ndarray
+    damping: np.ndarray  # of the damping ratio
+    stroke: np.ndarray  # of H_s
+
+
+def run_deviating(
+    plant: CantileverParameters,
+    feedforward: FeedforwardParameters,
+    feedback: FeedbackParameters,
+    temperature_degc: float,
+    reference: Profile,
+    samples: int,
+    deviations: Deviations,
+    random: np.random.Generator,
+    compiled: bool | None = None,
+) -> np.ndarray:
+    """Run a finger for each of `deviations`, all under one controller, from rest.
+
+    Parameters are those of :func:`run`; `random` draws what the sensors draw, so that the seed of `plant`
+    is not used.
+
+    Returns
+    -------
+    2-D array with shape (fingers, samples)
+        What the sensors read (m).
+    """
+    count = len(deviations.resonance)
+    inputs = Inputs(
+        reference.at(np.arange(samples) * plant.sample_time),
+        np.full(samples, temperature_degc),
+        np.zeros(samples),
+        random.standard_normal((count, samples)),
+        random.random((count, samples)),
+    )
+    finger = finger_at_rest(plant, feedforward, feedback, temperature_degc)
+    memory = tuple(_leaves((finger.feedback_state, finger.feedforward_state, finger.plant_state)))
+    deflection = np.empty((count, samples))
+    unused = Outputs(*np.empty((len(Outputs._fields), samples)))
+    fast = has_numba() if compiled is None else compiled
+    loop = compile_loop(run_fingers) if fast else run_fingers
+    at_rest = tuple(state.copy() for state in memory)
+    loop(finger, memory, at_rest, deviations, inputs, deflection, unused)
+    return deflection
+
+
 def drive(
     plant: CantileverParameters,
     temperatures: TemperatureParameters,
@@ -207,6 +257,60 @@ def _arrays(tree: Any) -> Any:
     if isinstance(tree, tuple):
         return type(tree)(*map(_arrays, tree))
     return np.array(tree, dtype=float) if isinstance(tree, list) else tree
+
+
+def _leaves(tree: Any) -> Iterator[np.ndarray]:
+    """Yield the arrays of nested tuples."""
+    for branch in tree:
+        if isinstance(branch, tuple):
+            yield from _leaves(branch)
+        else:
+            yield branch
+
+
+def run_fingers(
+    finger: Finger,
+    memory: tuple[np.ndarray, ...],
+    at_rest: tuple[np.ndarray, ...],
+    deviations: Deviations,
+    inputs: Inputs,
+    deflection: np.ndarray,
+    others: Outputs,
+) -> None:
+    """Run one finger after the other in the same `memory`; row n of `deflection` is that of finger n."""
+    for n in range(len(deflection)):
+        for state, initial in zip(memory, at_rest):
+            for i in range(len(state)):
+                state[i] = initial[i]
+        plant = deviating(
+            finger.plant, deviations.resonance[n], deviations.damping[n], deviations.stroke[n]
+        )
+        run_samples(
+            Finger(
+                finger.feedback,
+                finger.feedback_state,
+                finger.feedforward,
+                finger.feedforward_state,
+                plant,
+                finger.plant_state,
+            ),
+            Inputs(
+                inputs.reference,
+                inputs.temperature,
+                inputs.tip_force,
+                inputs.normal[n],
+                inputs.uniform[n],
+            ),
+            0,
+            1,
+            Outputs(
+                deflection[n],
+                others.command,
+                others.voltage,
+                others.total_force,
+                others.true_deflection,
+            ),
+        )
 
 
 def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs: Outputs) -> None:

@@ -1,6 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo: what is drawn, that it can be interrupted, and that it refuses to mix studies."""
 
+import math
+import os
+import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +16,12 @@ from piezo_control.metrics import step_metrics
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
 from piezo_sim import engine
+from piezo_sim.engine import Deviations
 from piezo_sim.experiment import monte_carlo
-from piezo_sim.experiment.monte_carlo import CHUNK, Study, deviate
+from piezo_sim.experiment.monte_carlo import CHUNK, Study
 from piezo_sim.plant.cantilever import CantileverParameters
+from piezo_sim.plant.contact import ContactParameters
+from piezo_sim.plant.sensor import SensorParameters
 from piezo_sim.temperature import TemperatureParameters
 
 PARAMS = Path(__file__).parent.parent / "params"
@@ -22,21 +29,68 @@ PAPER = build(FeedbackParameters, load(PARAMS / "feedback_paper.yaml", "feedback
 SHORT = Study(feedback=PAPER, samples=50)
 
 
+def deviating(plant, resonance, damping, stroke):
+    """A finger's parameters with these factors, by the definitions of resonance and damping ratio."""
+    a2, a1, a0 = plant.dynamics.denominator
+    dynamics = replace(
+        plant.dynamics, denominator=(a2 / resonance**2, a1 * damping / resonance, a0)
+    )
+    hysteresis = plant.hysteresis
+    weights = tuple(stroke * weight for weight in hysteresis.weights)
+    truth = plant.truth
+    per_decade = truth.creep_per_decade / stroke  # of the deflection: creep keeps its size
+    per_degc = truth.creep_per_decade_degc / stroke
+    return replace(
+        plant,
+        dynamics=dynamics,
+        hysteresis=replace(hysteresis, weights=weights),
+        truth=replace(
+            truth, slope=stroke * truth.slope, alpha=stroke * truth.alpha,
+            creep_per_decade=per_decade, creep_per_decade_degc=per_degc,
+        ),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("plant", ["prandtl_ishlinskii", "truth"])
-def test_a_deviating_finger_has_the_resonance_damping_and_stroke_asked_for(plant):
-    nominal = CantileverParameters(plant=plant)
-    other = deviate(nominal, resonance=0.8, damping=1.5, gain=1.1)
-    (a2, a1, _), (b2, b1, _) = nominal.dynamics.denominator, other.dynamics.denominator
-    assert b2**-0.5 == pytest.approx(0.8 * a2**-0.5)
-    assert b1 / b2**0.5 == pytest.approx(1.5 * a1 / a2**0.5)  # 2 x damping ratio
-    voltage = Profile([0.0, 0.1], [0.0, 40.0], linear=True)
-    degc = TemperatureParameters()
-    strokes = [engine.drive(p, degc, voltage, 1000).true_deflection[-1] for p in (nominal, other)]
-    assert strokes[1] / strokes[0] == pytest.approx(1.1, rel=2e-3)  # creep keeps its size
+@pytest.mark.parametrize("stiffness", [0.0, 300.0])
+def test_a_batch_is_one_run_after_the_other(plant, stiffness, compiled):
+    if compiled:
+        pytest.importorskip("numba")
+    nominal = CantileverParameters(
+        plant=plant,
+        sensor=SensorParameters(noise=0.0, resolution=0.0),
+        contact=ContactParameters(stiffness=stiffness, damping=0.01),
+    )
+    factors = Deviations(
+        np.array([0.8, 1.0, 1.2]), np.array([1.5, 1.0, 0.5]), np.array([1.1, 1, 0.9])
+    )
+    reference = Profile([0.0], [20e-6])
+    degc = TemperatureParameters(base_degc=30.0)
+    together = engine.run_deviating(
+        nominal, FeedforwardParameters(), PAPER, 30.0, reference, 300, factors,
+        np.random.default_rng(1), compiled,
+    )  # fmt: skip
+    for n, factor in enumerate(zip(*factors)):
+        finger = deviating(nominal, *factor)
+        alone = engine.run(finger, FeedforwardParameters(), PAPER, degc, reference, 300)
+        np.testing.assert_allclose(together[n], alone.deflection, rtol=0.0, atol=1e-13)
+
+
+def test_every_reading_of_every_draw_has_noise_of_its_own():
+    noise = SensorParameters(noise=5e-9, resolution=0.0)
+    readings = engine.run_deviating(
+        CantileverParameters(sensor=noise), FeedforwardParameters(), FeedbackParameters(), 22.0,
+        Profile([0.0], [0.0]), 500, Deviations(*np.ones((3, 40))), np.random.default_rng(1),
+    )[:, 1:]  # fmt: skip
+    # 20,000 independent readings: 4 standard deviations of a variance's and of a correlation's estimate
+    assert np.std(readings) == pytest.approx(5e-9, rel=4 / math.sqrt(2 * 20_000))
+    correlation = np.corrcoef(readings) - np.eye(40)
+    assert np.max(np.abs(correlation)) < 6 / math.sqrt(500)
 
 
 def test_draws_fill_the_box():
-    study = Study(resonance=0.2, damping=0.5, gain=0.1)
+    study = Study(resonance=0.2, damping=0.5, stroke=0.1)
     deviations = np.concatenate([study.factors(chunk) for chunk in range(20)]) - 1.0
     relative = deviations / [0.2, 0.5, 0.1]
     assert np.max(np.abs(relative)) <= 1.0
@@ -46,15 +100,46 @@ def test_draws_fill_the_box():
 
 
 def test_a_box_without_width_gives_the_nominal_step(tmp_path):
-    study = Study(feedback=PAPER, resonance=0.0, damping=0.0, gain=0.0)
+    plant = CantileverParameters(sensor=SensorParameters(noise=0.0, resolution=0.0))
+    study = Study(plant, feedback=PAPER, resonance=0.0, damping=0.0, stroke=0.0)
     draws = monte_carlo.monte_carlo(study, 1, tmp_path, workers=1)
     run = engine.run(
-        CantileverParameters(seed=0), FeedforwardParameters(), PAPER, TemperatureParameters(),
-        Profile([0.0], [20e-6]), 600,
-    )  # fmt: skip
+        plant, FeedforwardParameters(), PAPER, TemperatureParameters(), Profile([0.0], [20e-6]), 600
+    )
     expected = step_metrics(run.time, run.deflection, 20e-6)
-    assert [values[0] for values in draws.metrics] == list(expected)
+    assert [values[0] for values in draws.metrics] == pytest.approx(list(expected), rel=1e-9)
     assert draws.factors.tolist() == [[1.0, 1.0, 1.0]]
+
+
+def test_a_lost_worker_of_a_scheduler_costs_nothing(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    chunks = 40
+    here = monte_carlo.monte_carlo(SHORT, chunks * CHUNK, tmp_path / "here", workers=1)
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    )
+    lost = []
+
+    def lose_a_worker(done, total):
+        if not lost and done > 0:
+            lost.append(next(iter(cluster.workers.values())).pid)
+            os.kill(lost[0], signal.SIGKILL)
+
+    with cluster:
+        there = monte_carlo.monte_carlo(
+            SHORT, chunks * CHUNK, tmp_path / "there", lose_a_worker,
+            scheduler=cluster.scheduler_address,
+        )  # fmt: skip
+    assert lost
+    assert np.array_equal(there.factors, here.factors)
+    assert np.array_equal(there.metrics, here.metrics)
+
+
+def test_a_scheduler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(monte_carlo, "SCHEDULER_TIMEOUT", 1)
+    with pytest.raises(ParameterError, match="'scheduler' tcp://127.0.0.1:1 does not answer"):
+        monte_carlo.monte_carlo(SHORT, 1, tmp_path, scheduler="tcp://127.0.0.1:1")
 
 
 def test_an_interrupted_study_goes_on_with_the_same_numbers(tmp_path):
@@ -90,5 +175,5 @@ def test_command_line_prints_the_figures(tmp_path, capsys):
     printed = capsys.readouterr()
     assert "settling_5_final_s" in printed.out
     assert "20 of 20 draws" in printed.err
-    assert monte_carlo.main([str(tmp_path / "none.yaml"), "--out", str(tmp_path)]) == 1
+    assert monte_carlo.main([str(tmp_path / "none.yaml"), "--out", str(tmp_path)]) == 2
     assert "none.yaml: cannot be read" in capsys.readouterr().err

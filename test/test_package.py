@@ -24,6 +24,7 @@ EXECUTABLES = {
     "experiment",
     "identify",
     "synthesize",
+    "monte_carlo",
     "gripper",
 }
 

@@ -67,7 +67,7 @@ def test_settling_is_for_good_and_infinite_outside():
 def test_refuses_no_step_and_unequal_arrays():
     with pytest.raises(ValueError, match="there is no step"):
         step_metrics(TIME, TIME, 1.0, initial=1.0)
-    with pytest.raises(ValueError, match="equal 1-D shapes"):
+    with pytest.raises(ValueError, match="must be 1-D, as long as"):
         step_metrics(TIME, TIME[:-1], 1.0)
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Step responses over an uncertainty box: how a controller does on fingers that are not the nominal one.
 
-Resonance, damping and gain of the cantilever are drawn uniformly from a box; each draw is one run of
-the engine and the figures of its step response. Draws come in chunks of CHUNK, each a file of its own,
-so an interrupted study goes on where it stopped and gives the same numbers as an uninterrupted one.
+Resonance, damping and stroke of the cantilever are drawn uniformly from a box; each draw is one finger's
+step response in the compiled loop, and its figures. Draws come in chunks of CHUNK, each a file of its own,
+so an interrupted study goes on where it stopped and gives the same numbers as an uninterrupted one,
+whoever computes the chunks: the cores of this machine, or the workers of a dask scheduler.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,12 +25,14 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import StepMetrics, step_metrics
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
-from piezo_sim.engine import run
+from piezo_sim.engine import Deviations, run_deviating
 from piezo_sim.plant.cantilever import CantileverParameters
-from piezo_sim.temperature import TemperatureParameters
+from piezo_sim.plant.thermal import REFERENCE_DEGC
 
 CHUNK = 500
-FACTORS = ("resonance", "damping", "gain")
+FACTORS = Deviations._fields
+SCHEDULER_TIMEOUT = 30  # s
+RETRIES = 10
 
 
 @dataclass(frozen=True)
@@ -38,11 +42,11 @@ class Study:
     plant: CantileverParameters = field(default_factory=CantileverParameters)
     feedforward: FeedforwardParameters = field(default_factory=FeedforwardParameters)
     feedback: FeedbackParameters = field(default_factory=FeedbackParameters)
-    temperatures: TemperatureParameters = field(default_factory=TemperatureParameters)
+    temperature_degc: float = REFERENCE_DEGC
     resonance: float = 0.2
     """Largest relative deviation of the resonance frequency, below 1; of the next two likewise."""
     damping: float = 0.5
-    gain: float = 0.1
+    stroke: float = 0.1
     step: float = 20e-6
     """Step of the reference at sample 0, m."""
     samples: int = 600
@@ -54,7 +58,7 @@ class Study:
                 raise ParameterError(f"'{name}' is {getattr(self, name)}, must be in [0, 1)")
 
     def factors(self, chunk: int) -> np.ndarray:
-        """Return the factors on resonance, damping and gain of a chunk, shape (CHUNK, 3)."""
+        """Return the factors on resonance, damping and stroke of a chunk, shape (CHUNK, 3)."""
         random = np.random.default_rng([self.seed, chunk])
         widths = [getattr(self, name) for name in FACTORS]
         return 1.0 + widths * random.uniform(-1.0, 1.0, (CHUNK, len(FACTORS)))
@@ -68,39 +72,50 @@ class Draws:
     metrics: StepMetrics
 
 
-def deviate(
-    plant: CantileverParameters, resonance: float, damping: float, gain: float
-) -> CantileverParameters:
-    """Return `plant` with these factors on resonance, damping ratio and stroke."""
-    inertia, friction, stiffness = plant.dynamics.denominator
-    denominator = (inertia / resonance**2, friction * damping / resonance, stiffness)
-    hysteresis = plant.hysteresis
-    return replace(
-        plant,
-        dynamics=replace(plant.dynamics, denominator=denominator),
-        hysteresis=replace(hysteresis, weights=tuple(gain * w for w in hysteresis.weights)),
-        truth=replace(plant.truth, slope=gain * plant.truth.slope, alpha=gain * plant.truth.alpha),
-    )
-
-
 def run_chunk(study: Study, chunk: int) -> np.ndarray:
     """Return factors and metrics of the draws of a chunk, shape (CHUNK, 3 + metrics)."""
-    first = chunk * CHUNK
-    factors = study.factors(chunk).tolist()
-    return np.array([(*f, *run_draw(study, f, first + n)) for n, f in enumerate(factors)])
+    return run_draws(study, study.factors(chunk), np.random.default_rng([study.seed, chunk, 1]))
 
 
-def run_draw(study: Study, factors: Sequence[float], seed: int) -> StepMetrics:
-    """Return the figures of one finger, with factors as in FACTORS and a seed for its sensor."""
-    got = run(
-        replace(deviate(study.plant, *factors), seed=seed),
+def run_draws(study: Study, factors: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Return `factors`, shape (draws, 3) as in FACTORS, and beside them the figures of each draw."""
+    deflection = run_deviating(
+        study.plant,
         study.feedforward,
         study.feedback,
-        study.temperatures,
+        study.temperature_degc,
         Profile([0.0], [study.step]),
         study.samples,
+        Deviations(*np.ascontiguousarray(factors.T)),
+        random,
     )
-    return step_metrics(got.time, got.deflection, study.step)
+    time = np.arange(study.samples) * study.plant.sample_time
+    return np.column_stack([factors, *step_metrics(time, deflection, study.step)])
+
+
+@contextmanager
+def executor_of(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
+    """Return processes of this machine, all cores by default, or the workers of a dask `scheduler`.
+
+    Raises ParameterError when dask.distributed is not installed or the scheduler does not answer.
+    """
+    if scheduler is None:
+        with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
+            yield pool
+        return
+    try:
+        from distributed import Client
+    except ImportError:
+        raise ParameterError(
+            "'scheduler' needs dask.distributed: pip install 'piezo_gripper[cluster]'"
+        ) from None
+    try:
+        client = Client(scheduler, timeout=SCHEDULER_TIMEOUT)
+    except OSError as error:
+        raise ParameterError(f"'scheduler' {scheduler} does not answer: {error}") from None
+    with client:
+        # A chunk whose worker is lost is a chunk that another worker computes, as often as it takes.
+        yield client.get_executor(retries=RETRIES)
 
 
 def monte_carlo(
@@ -109,8 +124,9 @@ def monte_carlo(
     folder: str | Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
     workers: int | None = None,
+    scheduler: str | None = None,
 ) -> Draws:
-    """Run `draws` draws on `workers` processes (default: all cores) and return them.
+    """Run `draws` draws on `workers` processes (default: all cores), or on a dask `scheduler`, and return them.
 
     Chunks already in `folder` are not run again; `progress` is called with the draws done and all.
     Raises ParameterError when `folder` holds draws of another study.
@@ -128,9 +144,10 @@ def monte_carlo(
     done = len(files) - len(missing)
     progress(min(done * CHUNK, draws), draws)
     if missing:
-        run_draw(study, (1.0, 1.0, 1.0), 0)  # compiles the loop once, not in every process
-        with ProcessPoolExecutor(workers or os.cpu_count()) as pool:
-            futures = {pool.submit(run_chunk, study, chunk): chunk for chunk in missing}
+        # Compiles the loop once, not in every process.
+        run_draws(study, np.ones((1, len(FACTORS))), np.random.default_rng(0))
+        with executor_of(workers, scheduler) as executor:
+            futures = {executor.submit(run_chunk, study, chunk): chunk for chunk in missing}
             for future in as_completed(futures):
                 _write(files[futures[future]], future.result())
                 done += 1
@@ -140,10 +157,8 @@ def monte_carlo(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line: run a study, show its progress and print the percentiles of the figures."""
-    parser = argparse.ArgumentParser(
-        prog="python -m piezo_sim.experiment.monte_carlo", description=__doc__.splitlines()[0]
-    )
+    """Run the command line: a study, its progress, the percentiles; return 0 done, 2 unusable input."""
+    parser = argparse.ArgumentParser(prog="monte_carlo", description=__doc__.splitlines()[0])
     parser.add_argument("controller", help="parameter file of the node 'feedback'")
     parser.add_argument(
         "--out", default="out/monte_carlo", help="folder; started again, it goes on"
@@ -151,6 +166,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--draws", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, help="processes; default: one per core")
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="run on the workers of this dask scheduler instead"
+    )
     for name in FACTORS:
         parser.add_argument(
             f"--{name}", type=float, default=getattr(Study, name), help="half-width of the box"
@@ -161,10 +179,12 @@ def main(arguments: list[str] | None = None) -> int:
         feedback = build(FeedbackParameters, values, source=given.controller)
         widths = {name: getattr(given, name) for name in FACTORS}
         study = Study(feedback=feedback, seed=given.seed, **widths)
-        result = monte_carlo(study, given.draws, given.out, _show_progress, given.workers)
+        result = monte_carlo(
+            study, given.draws, given.out, _show_progress, given.workers, given.scheduler
+        )
     except ParameterError as error:
-        print(error, file=sys.stderr)
-        return 1
+        print(f"monte_carlo: {error}", file=sys.stderr)
+        return 2
     print(f"{'figure':26}{'median':>12}{'95 %':>12}{'worst':>12}")
     for name, values in result.metrics._asdict().items():
         percentiles = np.percentile(values, (50, 95, 100), method="lower")

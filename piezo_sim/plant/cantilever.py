@@ -35,7 +35,7 @@ from piezo_control.parameters import group, parameter
 from piezo_sim.plant import amplifier, contact, creep, thermal
 from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, AmplifierState, amplify
 from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
-from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip
+from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip, tip_of
 from piezo_sim.plant.creep import Creep, CreepParameters, creep_step
 from piezo_sim.plant.sensor import Sensor, SensorParameters, read
 from piezo_sim.plant.thermal import (
@@ -124,6 +124,39 @@ def model(parameters: CantileverParameters) -> CantileverModel:
         creep=creep.discretize(gain, gain_per_degc, times, shares, h),
         tip=contact.discretize(p.contact, p.dynamics, h),
         sensor=Sensor(p.sensor.resolution, p.sensor.noise, p.sensor.dropout_rate),
+    )
+
+
+def deviating(
+    m: CantileverModel, resonance: float, damping: float, stroke: float
+) -> CantileverModel:
+    """Return the model with these factors on resonance, damping ratio and H_s; creep keeps its size."""
+    heat = m.thermal
+    tip = m.tip
+    return CantileverModel(
+        m.amplifier,
+        m.is_truth,
+        m.operator,
+        m.bouc_wen,
+        Thermal(
+            heat.slope,
+            heat.stroke * stroke,
+            heat.gain_per_degc,
+            heat.lag_per_degc,
+            heat.sensitivity,
+            heat.retained,
+        ),
+        m.creep,
+        tip_of(
+            tip.a2 / resonance**2,
+            tip.a1 * damping / resonance,
+            tip.elastic_constant,
+            tip.stiffness,
+            tip.damping,
+            tip.free_play,
+            tip.sample_time,
+        ),
+        m.sensor,
     )
 
 

@@ -50,25 +50,51 @@ class Tip(NamedTuple):
     damping: float
     free_play: float
     elastic_constant: float
+    a2: float  # of the denominator of D(s), s²
+    a1: float  # s
+    sample_time: float
 
 
 def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_time: float) -> Tip:
     """Return the tip's exact motion for one sample time (s)."""
-    inertia, damping, stiffness = dynamics.denominator
-    softness = dynamics.elastic_constant
-    total_damping = damping + softness * contact.damping
-    total_stiffness = stiffness + softness * contact.stiffness
+    a2, a1, _ = dynamics.denominator
+    return tip_of(
+        a2,
+        a1,
+        dynamics.elastic_constant,
+        contact.stiffness,
+        contact.damping,
+        contact.free_play,
+        sample_time,
+    )
+
+
+def tip_of(
+    a2: float,
+    a1: float,
+    elastic_constant: float,
+    stiffness: float,
+    damping: float,
+    free_play: float,
+    sample_time: float,
+) -> Tip:
+    """Return the tip's exact motion of these numbers; a step function too, for fingers that deviate."""
+    total_damping = a1 + elastic_constant * damping
+    total_stiffness = 1.0 + elastic_constant * stiffness
     parts = 1
-    if contact.stiffness > 0.0:
-        parts = math.ceil(sample_time * math.sqrt(total_stiffness / inertia) / PART)
+    if stiffness > 0.0:
+        parts = math.ceil(sample_time * math.sqrt(total_stiffness / a2) / PART)
     return Tip(
         parts=parts,
-        free=propagator(inertia, damping, stiffness, sample_time / parts),
-        touching=propagator(inertia, total_damping, total_stiffness, sample_time / parts),
-        stiffness=contact.stiffness,
-        damping=contact.damping,
-        free_play=contact.free_play,
-        elastic_constant=softness,
+        free=propagator(a2, a1, 1.0, sample_time / parts),
+        touching=propagator(a2, total_damping, total_stiffness, sample_time / parts),
+        stiffness=stiffness,
+        damping=damping,
+        free_play=free_play,
+        elastic_constant=elastic_constant,
+        a2=a2,
+        a1=a1,
+        sample_time=sample_time,
     )
 
 

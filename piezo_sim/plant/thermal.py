@@ -46,6 +46,7 @@ class Thermal(NamedTuple):
     """Thermal effects over one sample."""
 
     slope: float  # of the straight line that hysteresis departs from, m/V
+    stroke: float  # factor on H_s; 1 for the nominal finger
     gain_per_degc: float
     lag_per_degc: float
     sensitivity: float  # m/°C
@@ -63,13 +64,13 @@ def discretize(parameters: ThermalParameters, slope: float, sample_time: float) 
     """Return the thermal effects for one sample time (s); `slope` (m/V) is that of the hysteresis."""
     p = parameters
     retained = math.exp(-sample_time / p.time_constant) if p.time_constant > 0.0 else 0.0
-    return Thermal(slope, p.gain_per_degc, p.lag_per_degc, p.sensitivity, retained)
+    return Thermal(slope, 1.0, p.gain_per_degc, p.lag_per_degc, p.sensitivity, retained)
 
 
 def heated(thermal: Thermal, deflection: float, voltage: float, warmth: float) -> float:
     """Return H_s(U, theta) for the `deflection` H_s(U) (m) and `warmth` = theta - 22 °C."""
     lag = thermal.slope * voltage - deflection
-    change = 1.0 + thermal.gain_per_degc * warmth
+    change = thermal.stroke * (1.0 + thermal.gain_per_degc * warmth)
     return change * (deflection - thermal.lag_per_degc * warmth * lag)
 
 
