@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
 
-.PHONY: help env demo paper figures bench test lint coverage clean distclean
+.PHONY: help env demo paper figures bench test lint coverage faults clean distclean
 
 help:
 	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
@@ -11,6 +11,7 @@ help:
 	@echo "make figures    the same, and the pictures of the README in docs/"
 	@echo "make bench      speed of the loop; results in out/bench.json"
 	@echo "make lint       ruff only"
+	@echo "make faults     a thousand random schedules of faults on live nodes; prints the seeds that fail"
 	@echo "make coverage   the tests once more, and the lines that none of them reaches"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
 	@echo "make clean      remove what was built and the results; distclean: the environment too"
@@ -35,6 +36,9 @@ test: lint
 
 lint: env
 	$(RUN) ruff check . && ruff format --check .
+
+faults: env
+	$(RUN) python test/faults.py
 
 coverage: env
 	$(RUN) coverage erase && coverage run -m pytest && coverage combine --quiet && coverage report

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import fnmatch
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -18,6 +19,9 @@ from typing import Any, TypeVar, get_type_hints
 import yaml
 
 T = TypeVar("T")
+
+OF_EVERY_NODE = {"autostart", "use_sim_time", "start_type_description_service", "qos_overrides"}
+"""Parameters that a dump of a running node has, and that are not the node's own."""
 
 
 class ParameterError(ValueError):
@@ -139,28 +143,44 @@ def check(name: str, value: Any, kind: type, field: dataclasses.Field) -> None:
                 )
 
 
+class RosLoader(yaml.SafeLoader):
+    """Reads YAML as ROS 2 does: `1e-4` is a number, too, which YAML 1.1 takes for a word."""
+
+
+RosLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"),
+    list("-+.0123456789"),
+)
+
+
 def load(path: str | Path, node: str) -> dict[str, Any]:
     """Return ``{dotted name: value}`` that a ROS parameter file gives to the node called `node`.
 
-    Keys match as in ROS 2: an exact name, ``/**`` for every node, ``/**/name`` for a name in any
-    namespace; later matches win. Raises ParameterError naming the file when it cannot be read, is no
+    Keys match by their last part, as a tool has no namespace: an exact name, ``/finger/name`` as `ros2 param
+    dump` writes it, ``/**`` for every node; later matches win. Raises ParameterError naming the file when it cannot be read, is no
     parameter file or has nothing for `node`.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text())
-    except (OSError, yaml.YAMLError) as error:
+        content = yaml.load(Path(path).read_text(), RosLoader)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise ParameterError(f"{path}: cannot be read as YAML: {error}") from None
+    except RecursionError:
+        raise ParameterError(f"{path}: cannot be read as YAML: nested too deeply") from None
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: not a ROS parameter file: the top level is no mapping")
     values: dict[str, Any] = {}
     matched = False
     for key, entry in content.items():
-        pattern = str(key).lstrip("/").replace("**/", "").replace("**", "*")
+        pattern = str(key).lstrip("/").replace("**/", "").replace("**", "*").split("/")[-1]
         if fnmatch.fnmatchcase(node, pattern):
             if not isinstance(entry, dict) or not isinstance(entry.get("ros__parameters"), dict):
                 raise ParameterError(f"{path}: '{key}' has no 'ros__parameters' mapping")
             matched = True
             values.update(_dotted(entry["ros__parameters"]))
+    for name in list(values):
+        if name.split(".")[0] in OF_EVERY_NODE:
+            del values[name]
     if not matched:
         raise ParameterError(f"{path}: nothing for node '{node}'; it has {list(content)}")
     return values

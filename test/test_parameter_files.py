@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter files as people and `ros2 param dump` write them, and files that are none."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.parameters import ParameterError, build, load
+
+
+def written(tmp_path, text):
+    path = tmp_path / "f.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_numbers_are_read_as_ros_reads_them(tmp_path):
+    text = "/**/feedforward: {ros__parameters: {static_gain: 55e-8, slew_limit: 1E4, voltage_low: -4e+1}}"
+    values = load(written(tmp_path, text), "feedforward")
+    assert values == {"static_gain": 5.5e-7, "slew_limit": 1e4, "voltage_low": -40.0}
+    assert build(FeedforwardParameters, values).slew_limit == 1e4
+
+
+def test_a_dump_of_a_running_node_is_read(tmp_path):
+    text = """
+/finger/feedforward:
+  ros__parameters:
+    autostart: true
+    qos_overrides: {/parameter_events: {publisher: {depth: 1000}}}
+    start_type_description_service: true
+    use_sim_time: false
+    voltage_high: 35.0
+"""
+    assert load(written(tmp_path, text), "feedforward") == {"voltage_high": 35.0}
+    with pytest.raises(ParameterError, match="nothing for node 'feedback'"):
+        load(written(tmp_path, text), "feedback")
+
+
+def test_later_matches_win_and_wildcards_count(tmp_path):
+    text = "/**: {ros__parameters: {a: 1, b: 2}}\nfeed*: {ros__parameters: {b: 3}}\n"
+    assert load(written(tmp_path, text), "feedforward") == {"a": 1, "b": 3}
+
+
+@pytest.mark.parametrize(
+    "data, words",
+    [
+        (b"\xff\xfe\x00binary\x81", "cannot be read as YAML"),
+        (b"[" * 5000, "cannot be read as YAML"),
+        (b"- a list", "top level is no mapping"),
+        (b"/**: 7", "has no 'ros__parameters' mapping"),
+        (b"a: b: c", "cannot be read as YAML"),
+    ],
+)
+def test_what_is_no_parameter_file_is_refused_by_name(tmp_path, data, words):
+    path = tmp_path / "f.yaml"
+    path.write_bytes(data)
+    with pytest.raises(ParameterError, match=f"f.yaml: .*{words}"):
+        load(path, "feedforward")
+
+
+@given(st.binary(max_size=300) | st.text(max_size=300).map(str.encode))
+def test_rubbish_never_ends_in_another_error(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp("rubbish") / "f.yaml"
+    path.write_bytes(data)
+    with pytest.raises(ParameterError, match="f.yaml"):
+        build(FeedforwardParameters, load(path, "feedforward"), str(path))
