@@ -3,43 +3,20 @@
 
 A finished bag is read by `rosbags`. A recorder that was killed leaves no `metadata.yaml`, and a full
 disk or an interrupted copy ends a file in the middle; then the MCAP or SQLite file is read record by
-record, up to the place where it breaks. MCAP: https://mcap.dev/spec; schema of the SQLite file:
+record, up to the place where it breaks. Schema of the SQLite file:
 https://github.com/ros2/rosbag2/tree/jazzy/rosbag2_storage_sqlite3.
 """
 
 from __future__ import annotations
 
 import sqlite3
-import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
-import lz4.frame
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
-from mcap.well_known import SchemaEncoding
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import ReaderError
-from rosbags.serde import SerdeError
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode, length
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-CHUNK_COMPRESSION = 28  # offset of the length of a chunk's compression name
-DECOMPRESS = {
-    "": lambda data: data,
-    "zstd": lambda data: zstandard.ZstdDecompressor().decompressobj().decompress(data),
-    "lz4": lambda data: lz4.frame.LZ4FrameDecompressor().decompress(data),
-}
-"""Decompressors that give what they can of data that was cut off."""
 
 
 class BagError(ValueError):
@@ -74,7 +51,7 @@ class Bag:
             raise BagError(f"{self.path}: topic '{topic}' is of type {found.type}, must be {kind}")
         try:
             return [self.typestore.deserialize_cdr(data, kind) for data in found.data]
-        except (SerdeError, KeyError) as error:
+        except Exception as error:  # of the library that takes the bytes apart, whatever they are
             raise BagError(
                 f"{self.path}: topic '{topic}' cannot be read as {kind}: {error}"
             ) from None
@@ -98,8 +75,8 @@ def open_bag(path: str | Path) -> Bag:
     if path.is_dir() and (path / "metadata.yaml").exists():
         try:
             return _whole(path)
-        except (AnyReaderError, ReaderError, OSError, struct.error, TypeError, ValueError) as error:
-            damage = str(error)
+        except Exception as error:  # of the reader's library: damage leads it to any kind of error
+            damage = f"damaged: {error}" if str(error) else f"damaged ({type(error).__name__})"
     else:
         damage = "the recorder did not finish it: metadata.yaml is missing" if path.is_dir() else ""
     bag = Bag(path, get_typestore(Stores.ROS2_JAZZY), {}, damage)
@@ -132,47 +109,28 @@ def _learn(typestore: Typestore, name: str, text: str, is_idl: bool) -> None:
 
 def _read_mcap(path: Path, bag: Bag) -> bool:
     """Add the messages of an MCAP file and say whether it is whole."""
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Topic] = {}
-    whole = False
-    with path.open("rb") as file:
-        if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-            raise BagError(f"{path}: no MCAP file: it does not begin with MCAP's magic bytes")
-        try:
-            for opcode, content in _mcap_records(file):
-                whole = opcode == Opcode.FOOTER
-                if opcode == Opcode.SCHEMA:
-                    schema = Schema.read(ReadDataStream(BytesIO(content)))
-                    schemas[schema.id] = schema
-                    is_idl = schema.encoding == SchemaEncoding.ROS2IDL
-                    _learn(bag.typestore, schema.name, schema.data.decode(), is_idl)
-                elif opcode == Opcode.CHANNEL:
-                    channel = Channel.read(ReadDataStream(BytesIO(content)))
-                    kind = schemas[channel.schema_id].name
-                    channels[channel.id] = bag.topics.setdefault(channel.topic, Topic(kind))
-                elif opcode == Opcode.MESSAGE:
-                    number, _, stamp, _ = MESSAGE.unpack_from(content)
-                    channels[number].stamps.append(stamp)
-                    channels[number].data.append(content[MESSAGE.size :])
-        except (McapError, struct.error, KeyError, zstandard.ZstdError, RuntimeError) as error:
-            bag.damage = f"{path.name} is damaged: {error!r}"
-    return whole
+    try:
+        from piezo_control.recording.mcap_records import read_records
+    except ImportError as error:
+        raise BagError(
+            f"{path}: not read as a whole bag; for the rest, install {error.name}"
+        ) from None
 
+    def learn(kind: str, definition: str, is_idl: bool) -> None:
+        _learn(bag.typestore, kind, definition, is_idl)
 
-def _mcap_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and content of all whole records, those inside of chunks as well."""
-    while len(head := file.read(RECORD.size)) == RECORD.size:
-        opcode, length = RECORD.unpack(head)
-        content = file.read(length)
-        if opcode == Opcode.CHUNK and len(content) > CHUNK_COMPRESSION + 4:
-            (size,) = struct.unpack_from("<I", content, CHUNK_COMPRESSION)
-            begin = CHUNK_COMPRESSION + 4 + size
-            compression = content[CHUNK_COMPRESSION + 4 : begin].decode()
-            if compression not in DECOMPRESS:
-                raise McapError(f"unknown compression '{compression}'")
-            yield from _mcap_records(BytesIO(DECOMPRESS[compression](content[begin + 8 :])))
-        elif len(content) == length:
-            yield opcode, content
+    def add(name: str, kind: str, stamp: int, data: bytes) -> None:
+        topic = bag.topics.setdefault(name, Topic(kind))
+        topic.stamps.append(stamp)
+        topic.data.append(data)
+
+    try:
+        return read_records(path, learn, add)
+    except (
+        Exception
+    ) as error:  # of what takes the records apart: damage leads it to any kind of error
+        bag.damage = f"{path.name} is damaged: {error!r}"
+        return False
 
 
 def _read_sqlite(path: Path, bag: Bag) -> bool:
@@ -194,7 +152,7 @@ def _read_sqlite(path: Path, bag: Bag) -> bool:
             topic = bag.topics.setdefault(name, Topic(kind))
             topic.stamps.append(stamp)
             topic.data.append(data)
-    except sqlite3.Error as error:
+    except Exception as error:  # of the database or of what its definitions say
         bag.damage = f"{path.name} is damaged: {error}"
         return False
     finally:
