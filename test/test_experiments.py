@@ -3,6 +3,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 
 import numpy as np
@@ -344,6 +345,9 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
         (("--controller", "unheard_of"), "feedback_unheard_of.yaml"),
         (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
         (("--duration", -1.0), "'duration' is -1.0, must be a number above 0.0"),
+        (("--duration", math.inf), "'duration' is inf, must be a number above 0.0"),
+        (("--params", "/nowhere"), "params: /nowhere is no folder"),
+        (("--params", tmp_path), "has none of feedforward.yaml, "),
         (("--temperature", 400.0), "base_degc"),
     ):
         assert run_cli(monkeypatch, "step", "--engine", "--out", out, *words) == 2

@@ -143,3 +143,25 @@ def test_measured_actuator_from_its_file(identify, tmp_path, model, plays, limit
 def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, arguments, message):
     assert identify(*arguments) == 2
     assert message in capsys.readouterr().err
+
+
+def test_nothing_is_replaced_unasked_and_no_bad_fit_is_written(identify, tmp_path, capsys):
+    time = 0.005 * np.arange(400)
+    voltage = 30.0 * np.sin(2.0 * np.pi * time)
+    rows = np.column_stack((time, voltage, 0.5 * voltage))
+    good, outlier = tmp_path / "good.csv", tmp_path / "outlier.csv"
+    np.savetxt(good, rows, delimiter=",", header="time,voltage,deflection_um", comments="")
+    rows[200, 1] = 400.0  # one reading of the voltmeter
+    rows[:, 2] += np.random.default_rng(1).normal(0.0, 8.0, 400)
+    np.savetxt(outlier, rows, delimiter=",", header="time,voltage,deflection_um", comments="")
+    words = ("--plays", "4", "--skip", "0", "--lag", "0")
+    assert identify("hysteresis", outlier, *words) == 2
+    assert "explains too little" in capsys.readouterr().err
+    path = tmp_path / "identified" / "feedforward.yaml"
+    assert not path.exists()
+    assert identify("hysteresis", good, *words) == 0
+    before = path.read_text()
+    assert build(FeedforwardParameters, load(path, "feedforward")).voltage_high == 40.0
+    assert identify("hysteresis", good, *words) == 2
+    assert "--overwrite" in capsys.readouterr().err and path.read_text() == before
+    assert identify("hysteresis", good, *words, "--overwrite") == 0

@@ -43,6 +43,9 @@ def main() -> int:
     begin = time.perf_counter()
     try:
         problem = read_problem(arguments.problem, arguments.cantilever)
+        out = arguments.out or Path(f"feedback_{problem.name}.yaml")
+        if out.exists() and not arguments.overwrite:
+            raise ParameterError(f"{out} exists; name a new --out or give --overwrite")
         design = synthesize(problem)
     except (ParameterError, SynthesisError) as error:
         print(f"synthesize: {arguments.problem}: {error}", file=sys.stderr)
@@ -51,7 +54,6 @@ def main() -> int:
     show(console, certificate)
     report = arguments.report or Path("out", "synthesize", problem.name)
     written = write_report(report, design.problem, design.controller, certificate)
-    out = arguments.out or Path(f"feedback_{problem.name}.yaml")
     if certificate.met or arguments.force:
         controller = dataclasses.replace(design.controller, certified=certificate.met)
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -179,6 +181,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="synthesize", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace a controller in --out")
     parser.add_argument(
         "problem", type=Path, help="design problem, e.g. params/synthesis_robust.yaml"
     )

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,12 +38,29 @@ NODES = {
 MODES = ("open_loop", "feedforward", "feedback")
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
 EXPERIMENT_KEYS = {
-    "title", "controller", "sample_time", "plant", "temperature_degc", "engine", "runs",
-}  # fmt: skip
-RUN_KEYS = (EXPERIMENT_KEYS - {"title", "runs"}) | {
-    "name", "analysis", "duration", "every", "reference", "voltage", "tip_force", "mode",
-    "temperature", "params",
-}  # fmt: skip
+    "title": "heading of the report",
+    "controller": "controllers of the runs with feedback: params/feedback_NAME.yaml; one, or a list",
+    "sample_time": "sample time of every node (s)",
+    "plant": "class of the plant: prandtl_ishlinskii or truth",
+    "temperature_degc": "list of constant temperatures (°C), one case for each",
+    "engine": "run on the engine instead of nodes: true or false",
+    "params": "folder whose NODE.yaml and feedback_NAME.yaml replace defaults and shipped controllers",
+    "runs": "list of runs, each with the keys below",
+}
+"""Keys of an experiment's YAML, with what they mean."""
+RUN_KEYS = {
+    **{key: text for key, text in EXPERIMENT_KEYS.items() if key not in ("title", "runs")},
+    "name": "name of the run, the beginning of its cases' names",
+    "analysis": "how its recording is analysed; the experiment's name if left out",
+    "duration": "length (s)",
+    "every": "on the engine: every so many samples are recorded",
+    "mode": "open_loop, feedforward or feedback; one, or a list",
+    "reference": "profile of the reference: shape, amplitude_um, …",
+    "voltage": "profile of the voltage instead, in open loop: shape, amplitude_v, …",
+    "tip_force": "profile of a force on the tip: shape, amplitude_mn, …",
+    "temperature": "parameters of the temperature node instead of temperature_degc",
+}
+"""Keys of a run; those of the experiment hold where a run does not say otherwise."""
 NEEDED_KEYS = ("name", "duration", "sample_time", "mode")
 UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
 
@@ -171,6 +189,8 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
 
     Raises ParameterError naming file, run and key.
     """
+    if "params" in overrides:
+        _need_parameters(overrides["params"])
     path = params_folder() / "experiments" / f"{name}.yaml"
     try:
         content = yaml.safe_load(path.read_text())
@@ -191,8 +211,17 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
     return title, cases
 
 
-def _refuse_unknown(mapping: Mapping[str, Any], known: set[str], where: str) -> None:
-    unknown = set(mapping) - known
+def _need_parameters(folder: Path) -> None:
+    """Refuse a folder that has nothing to replace anything with."""
+    if not folder.is_dir():
+        raise ParameterError(f"params: {folder} is no folder")
+    fitting = [*(f"{node}.yaml" for node in NODES), "feedback_*.yaml"]
+    if not any(path for name in fitting for path in folder.glob(name)):
+        raise ParameterError(f"params: {folder} has none of {', '.join(fitting)}")
+
+
+def _refuse_unknown(mapping: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    unknown = set(mapping) - set(known)
     if unknown:
         raise ParameterError(f"{where}: unknown keys {sorted(unknown)}; known: {sorted(known)}")
 
@@ -215,7 +244,7 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
         if key not in run:
             raise ParameterError(f"{where}: key '{key}' is missing")
     for key in ("duration", "sample_time"):
-        if not (isinstance(run[key], float) and run[key] > 0.0):
+        if not (isinstance(run[key], float) and 0.0 < run[key] < math.inf):
             raise ParameterError(
                 f"{where}: '{key}' is {run[key]!r}, must be a number above 0.0 (s)"
             )
