@@ -269,6 +269,34 @@ def operator_step(operator: Coefficients, s: State, voltage: float) -> float:
     return dead_zones(operator, hysteresis)
 
 
+def operator_inverse(
+    operator: Coefficients, s: State, value: float, scale: float, line: float
+) -> float:
+    """Return the voltage u (V) at which scale H(u) + line u is `value` (m); nothing moves yet.
+
+    Solved on the operator's own plays, so that `scale` and `line` (m/V) may change from sample to sample
+    where the inverse's plays would have to be mapped. From the last voltage on, the plays join in their
+    order, each adding its weight to the slope. Every slope scale W_i + line must be positive; for the
+    classical operator with constant thresholds.
+    """
+    thresholds, weights, plays = operator.thresholds, operator.weights, s.plays
+    voltage = s.voltage[0]
+    reached = line * voltage
+    for i in range(len(weights)):
+        reached += scale * weights[i] * plays[i]
+    direction = 1.0 if value >= reached else -1.0
+    slope = scale * weights[0] + line
+    for i in range(1, len(weights)):
+        joins = plays[i] + direction * thresholds[i]
+        there = reached + slope * (joins - voltage)
+        if direction * (value - there) <= 0.0:
+            break
+        reached = there
+        voltage = joins
+        slope += scale * weights[i]
+    return voltage + (value - reached) / slope
+
+
 def inverse_voltage(inverse: Coefficients, s: State, deflection: float) -> float:
     """Return the voltage (V) that leads the actuator to `deflection` (m); nothing moves yet."""
     return plays_output(inverse, s, dead_zones(inverse, deflection))

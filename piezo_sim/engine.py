@@ -11,7 +11,7 @@ as Python, slowly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -37,6 +37,14 @@ from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording
 from piezo_control.safety import VoltageParameters
+from piezo_control.sensorless import (
+    SensorlessCoefficients,
+    SensorlessParameters,
+    SensorlessState,
+    sensorless_coefficients,
+    sensorless_rest,
+    sensorless_step,
+)
 from piezo_sim.plant import cantilever
 from piezo_sim.plant.cantilever import (
     CantileverModel,
@@ -86,6 +94,15 @@ class Outputs(NamedTuple):
     true_deflection: np.ndarray
 
 
+class SensorlessFinger(NamedTuple):
+    """Coefficients and states of a finger without a sensor."""
+
+    law: SensorlessCoefficients
+    law_state: SensorlessState
+    plant: CantileverModel
+    plant_state: CantileverState
+
+
 class Finger(NamedTuple):
     """Coefficients and states of all the laws of one finger."""
 
@@ -123,21 +140,88 @@ def run(
     `samples` or `every` is below 1.
     """
     h = plant.sample_time
-    if samples < 1 or every < 1:
-        raise ValueError(f"samples is {samples}, every is {every}: both must be 1 or more")
     if feedback.controller != "none" and feedback.sample_time != h:
         raise ParameterError(
             f"feedback 'sample_time' is {feedback.sample_time} s, must be the cantilever's: {h} s"
         )
-    time = np.arange(samples) * h
+    finger = finger_at_rest(plant, feedforward, feedback, temperatures_of(temperatures, h, 1)[0])
+    clipped = finger.feedforward_state.clipped
+    return _run(
+        run_samples,
+        finger,
+        clipped,
+        plant,
+        temperatures,
+        reference,
+        samples,
+        tip_force,
+        every,
+        compiled,
+    )
+
+
+def run_sensorless(
+    plant: CantileverParameters,
+    sensorless: SensorlessParameters,
+    temperatures: TemperatureParameters,
+    reference: Profile,
+    samples: int,
+    tip_force: Profile | None = None,
+    every: int = 1,
+    compiled: bool | None = None,
+) -> Run:
+    """Run a finger whose voltage comes from its models and the thermocouple, no sensor in the loop.
+
+    Parameters as in :func:`run`. Raises ParameterError when the models have no inverse.
+    """
+    degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
+    law = sensorless_coefficients(sensorless, plant.sample_time)
+    sampled = cantilever.model(plant)
+    finger = _arrays(
+        SensorlessFinger(
+            law,
+            sensorless_rest(law, degc),
+            sampled,
+            cantilever.rest(sampled, plant.sensor.delay_samples, degc),
+        )
+    )
+    clipped = finger.law_state.clipped
+    return _run(
+        run_sensorless_samples, finger, clipped, plant, temperatures, reference, samples, tip_force,
+        every, compiled,
+    )  # fmt: skip
+
+
+def temperatures_of(
+    temperatures: TemperatureParameters, sample_time: float, samples: int
+) -> np.ndarray:
+    """Return the temperature (°C) of each of the first `samples` samples."""
+    index = grid_index(np.arange(samples), sample_time, temperatures.period)
+    return temperature(temperatures, 0, int(index[-1]) + 1)[index]
+
+
+def _run(
+    loop: Callable[..., None],
+    finger: Any,
+    clipped: np.ndarray,
+    plant: CantileverParameters,
+    temperatures: TemperatureParameters,
+    reference: Profile,
+    samples: int,
+    tip_force: Profile | None,
+    every: int,
+    compiled: bool | None,
+) -> Run:
+    """Run `loop` over all samples; `clipped` is where the law of the voltage counts."""
+    if samples < 1 or every < 1:
+        raise ValueError(f"samples is {samples}, every is {every}: both must be 1 or more")
+    time = np.arange(samples) * plant.sample_time
     references = reference.at(time)
     forces = np.zeros(samples) if tip_force is None else tip_force.at(time)
-    index = grid_index(np.arange(samples), h, temperatures.period)
-    degc = temperature(temperatures, 0, int(index[-1]) + 1)[index]
-    finger = finger_at_rest(plant, feedforward, feedback, float(degc[0]))
+    degc = temperatures_of(temperatures, plant.sample_time, samples)
     outputs = Outputs(*np.empty((len(Outputs._fields), -(-samples // every))))
     fast = has_numba() if compiled is None else compiled
-    loop = compile_loop(run_samples) if fast else run_samples
+    loop = compile_loop(loop) if fast else loop
     noise, dropouts = cantilever.generators(plant.seed)
     for first in range(0, samples, AT_ONCE):
         last = min(first + AT_ONCE, samples)
@@ -161,7 +245,7 @@ def run(
         tip_force=forces[::every],
         true_deflection=outputs.true_deflection,
         total_force=outputs.total_force,
-        clipped=int(finger.feedforward_state.clipped[0] + amplifier_clips),
+        clipped=int(clipped[0] + amplifier_clips),
     )
 
 
@@ -328,6 +412,26 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
             row = (first + n) // every
             outputs.deflection[row] = deflection
             outputs.command[row] = command
+            outputs.voltage[row] = voltage
+            outputs.total_force[row] = state.tip_force[0]
+            outputs.true_deflection[row] = deflection_of(plant, state)
+        advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
+
+
+def run_sensorless_samples(
+    finger: SensorlessFinger, inputs: Inputs, first: int, every: int, outputs: Outputs
+) -> None:
+    """Run the samples of `inputs` without a sensor, the first one being number `first`."""
+    plant = finger.plant
+    state = finger.plant_state
+    for n in range(len(inputs.reference)):
+        look(plant, state, inputs.normal[n], inputs.uniform[n])
+        reference = inputs.reference[n]
+        voltage = sensorless_step(finger.law, finger.law_state, reference, inputs.temperature[n])
+        if (first + n) % every == 0:
+            row = (first + n) // every
+            outputs.deflection[row] = state.readings[0]
+            outputs.command[row] = reference
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)

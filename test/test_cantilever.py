@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from piezo_control.creep import CreepParameters
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.hysteresis import Hysteresis
+from piezo_control.thermal import ThermalParameters
 from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 from piezo_sim.plant.contact import ContactParameters
-from piezo_sim.plant.creep import CreepParameters
 from piezo_sim.plant.sensor import SensorParameters
-from piezo_sim.plant.thermal import ThermalParameters
 
 PERFECT = SensorParameters(resolution=0.0, noise=0.0, delay_samples=0)
 

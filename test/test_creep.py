@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
+from piezo_control.creep import CreepParameters, creep_step, discretize, logarithmic
 from piezo_control.parameters import ParameterError
-from piezo_sim.plant.creep import CreepParameters, creep_step, discretize, logarithmic
 
 
 @pytest.mark.parametrize("sample_time", [1e-3, 0.1, 5.0])

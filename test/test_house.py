@@ -13,8 +13,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # Bottom to top; the longest matching name counts. A module imports from its own level or below.
 LEVELS = [
     {"parameters", "profile", "metrics", "safety", "sequence", "shared", "compiled"},
-    {"hysteresis", "dynamics", "feedback", "gripper", "recording"},
-    {"feedforward", "design"},
+    {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
+    {"shaping", "feedforward", "sensorless", "design"},
     {"identification", "nodes"},
     {"plant", "temperature"},
     {"engine", "sim_nodes"},

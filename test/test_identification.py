@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piezo_control.creep import CreepParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.excitation import decaying_sine
@@ -19,7 +20,6 @@ from piezo_control.identification.measurement import Measurement, MeasurementErr
 from piezo_control.parameters import ParameterError
 from piezo_sim.engine import drive
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
-from piezo_sim.plant.creep import CreepParameters
 from piezo_sim.temperature import TemperatureParameters
 
 P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"

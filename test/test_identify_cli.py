@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piezo_control.creep import CreepParameters
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.identification.cli import main
@@ -18,7 +19,6 @@ from piezo_control.profile import Profile
 from piezo_control.recording.writer import write_recording
 from piezo_sim.engine import drive, run
 from piezo_sim.plant.cantilever import CantileverParameters
-from piezo_sim.plant.creep import CreepParameters
 from piezo_sim.temperature import TemperatureParameters
 
 P885 = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"

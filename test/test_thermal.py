@@ -5,7 +5,7 @@ import math
 
 import pytest
 
-from piezo_sim.plant.thermal import Body, ThermalParameters, discretize, warm
+from piezo_control.thermal import Body, ThermalParameters, discretize, warm
 
 
 def temperature_after(time_constant, sample_time, samples):

@@ -24,8 +24,8 @@ from scipy.signal import lfilter
 
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.measurement import Measurement, MeasurementError
+from piezo_control.thermal import REFERENCE_DEGC
 
-REFERENCE_DEGC = 22.0
 ROWS = 3000  # per recording, of block means: vibration and noise average out
 RELAXATIONS = 3
 JUMP = 0.1  # of the static range, from block to block: such blocks ring and are not fitted

@@ -25,9 +25,9 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import StepMetrics, step_metrics
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.profile import Profile
+from piezo_control.thermal import REFERENCE_DEGC
 from piezo_sim.engine import Deviations, run_deviating
 from piezo_sim.plant.cantilever import CantileverParameters
-from piezo_sim.plant.thermal import REFERENCE_DEGC
 
 CHUNK = 500
 FACTORS = Deviations._fields

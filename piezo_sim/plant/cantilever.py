@@ -23,6 +23,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from piezo_control import creep, thermal
+from piezo_control.creep import Creep, CreepParameters, creep_step
 from piezo_control.dynamics import DynamicsParameters, Motion
 from piezo_control.hysteresis import (
     Coefficients,
@@ -32,13 +34,7 @@ from piezo_control.hysteresis import (
     operator_step,
 )
 from piezo_control.parameters import group, parameter
-from piezo_sim.plant import amplifier, contact, creep, thermal
-from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, AmplifierState, amplify
-from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
-from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip, tip_of
-from piezo_sim.plant.creep import Creep, CreepParameters, creep_step
-from piezo_sim.plant.sensor import Sensor, SensorParameters, read
-from piezo_sim.plant.thermal import (
+from piezo_control.thermal import (
     REFERENCE_DEGC,
     Body,
     Thermal,
@@ -47,6 +43,11 @@ from piezo_sim.plant.thermal import (
     thermal_deflection,
     warm,
 )
+from piezo_sim.plant import amplifier, contact
+from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, AmplifierState, amplify
+from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
+from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip, tip_of
+from piezo_sim.plant.sensor import Sensor, SensorParameters, read
 
 DRAWS_AT_ONCE = 4096
 

@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feedforward without a sensor: hysteresis, vibration, creep and heat undone by their models.
+
+The finger is the paper's equation (3) without a tip force,
+
+    delta = H_s(U, theta) D(s) + g(theta) + Creep(U, theta),
+
+with the body's temperature theta behind the thermocouple's. Per sample the shaped reference w_k (no
+vibration, :mod:`piezo_control.shaping`) has to be reached at the end of the sample,
+
+    scale H(U_k) + line U_k = w_k - g(theta_k+1) - sum_i retained_i c_i,
+    scale = (1 + gain_per_degc warmth) (1 + lag_per_degc warmth),
+    line  = sum_i released_i gain(theta) - (1 + gain_per_degc warmth) lag_per_degc warmth slope,
+
+where c_i are the relaxations of creep, warmth = theta_k - 22 °C. The left side is the Prandtl-Ishlinskii
+operator with weights that follow the temperature. Its plays do not: they follow the voltage alone, so
+whatever the temperature does, memory stays right and the voltage has no bump. Solved exactly, with creep's
+part within the sample, so for a finger that is its model nothing is left but the vibration that shaping
+leaves. Where a limit acts, the models follow the voltage applied.
+
+Source: M. Rakotondrabe, C. Clévy, P. Lutz, *Complete open loop control of hysteretic, creeped, and
+oscillating piezoelectric cantilevers*, IEEE T-ASE 7 (2010) 440, for the structure; the inverse that follows
+the temperature is solved play by play as in :mod:`piezo_control.hysteresis`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+
+from piezo_control import creep, shaping, thermal
+from piezo_control.creep import Creep, CreepParameters, creep_step
+from piezo_control.dynamics import DynamicsParameters
+from piezo_control.hysteresis import (
+    Coefficients,
+    HysteresisParameters,
+    State,
+    coefficients,
+    operator_inverse,
+    operator_step,
+)
+from piezo_control.parameters import ParameterError, group, parameter
+from piezo_control.safety import VoltageParameters, limited
+from piezo_control.shaping import ShapingParameters, shape
+from piezo_control.thermal import (
+    REFERENCE_DEGC,
+    Body,
+    Thermal,
+    ThermalParameters,
+    heated,
+    thermal_deflection,
+    warm,
+)
+
+
+@dataclass(frozen=True)
+class SensorlessParameters(VoltageParameters):
+    """Models of one finger, as `identify` writes them, and the voltage limits."""
+
+    temperature_low: float = parameter(
+        10.0,
+        "lowest temperature it is for; colder counts as this",
+        unit="degC",
+        low=-50.0,
+        high=22.0,
+    )
+    temperature_high: float = parameter(
+        45.0,
+        "highest temperature it is for; warmer counts as this",
+        unit="degC",
+        low=22.0,
+        high=150.0,
+    )
+    hysteresis: HysteresisParameters = group(HysteresisParameters)
+    dynamics: DynamicsParameters = group(DynamicsParameters)
+    creep: CreepParameters = group(CreepParameters)
+    thermal: ThermalParameters = group(ThermalParameters)
+    shaping: ShapingParameters = group(ShapingParameters)
+
+
+class SensorlessCoefficients(NamedTuple):
+    """What :func:`sensorless_step` needs of the parameters."""
+
+    operator: Coefficients
+    creep: Creep
+    thermal: Thermal
+    taps: Sequence[float]
+    low: float  # V
+    high: float  # V
+    step_limit: float  # V per sample
+    coldest: float  # °C
+    warmest: float  # °C
+
+
+class SensorlessState(NamedTuple):
+    """What :func:`sensorless_step` remembers, changed in place: lists (or float64 arrays)."""
+
+    hysteresis: State
+    relaxations: list[float]  # m
+    body: Body
+    past: list[float]  # references (m), newest first
+    offset: list[float]  # m, added to the reference since a hand-over
+    clipped: list[float]  # number of samples at which a limit acted
+    blind: list[float]  # number of samples without a temperature
+
+
+def sensorless_coefficients(
+    parameters: SensorlessParameters, sample_time: float
+) -> SensorlessCoefficients:
+    """Return the coefficients for a sample time (s).
+
+    Raises
+    ------
+    ParameterError
+        If the hysteresis is one that has no inverse here (dead zones, rate-dependent thresholds), or none at
+        a temperature within the range; the message names which.
+    """
+    p = parameters
+    h = p.hysteresis
+    if h.upper_thresholds or h.lower_thresholds or h.rate_coefficient:
+        raise ParameterError(
+            "'hysteresis' has dead zones or rate-dependent thresholds: the sensorless inverse is for the "
+            "classical operator, `identify hysteresis` without them"
+        )
+    operator = coefficients(h, sample_time)
+    slopes = list(accumulate(operator.weights))
+    for degc in (p.temperature_low, p.temperature_high):
+        # Between the two the slopes of the inverse are on straight lines but for a positive factor.
+        warmth = degc - REFERENCE_DEGC
+        softening = p.thermal.lag_per_degc * warmth
+        least = min((1.0 + softening) * slope - softening * slopes[-1] for slope in slopes)
+        if not (least > 0.0 and 1.0 + p.thermal.gain_per_degc * warmth > 0.0):
+            raise ParameterError(
+                f"'thermal.gain_per_degc' {p.thermal.gain_per_degc} and 'thermal.lag_per_degc' "
+                f"{p.thermal.lag_per_degc} leave no inverse at {degc:g} °C"
+            )
+    times, shares = np.array(p.creep.times), np.array(p.creep.shares)
+    return SensorlessCoefficients(
+        operator=operator,
+        creep=creep.discretize(p.creep.gain, p.creep.gain_per_degc, times, shares, sample_time),
+        thermal=thermal.discretize(p.thermal, slopes[-1], sample_time),
+        taps=shaping.shaper(p.shaping, p.dynamics.denominator, sample_time),
+        low=p.voltage_low,
+        high=p.voltage_high,
+        step_limit=p.slew_limit * sample_time,
+        coldest=p.temperature_low,
+        warmest=p.temperature_high,
+    )
+
+
+def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> SensorlessState:
+    """Return the state of a homed finger at 0 V, in equilibrium with `temperature_degc`."""
+    start = min(max(temperature_degc, c.coldest), c.warmest)
+    return SensorlessState(
+        hysteresis=State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0]),
+        relaxations=[0.0] * len(c.creep.retained),
+        body=Body([start], degc_at_start=[start]),
+        past=[0.0] * len(c.taps),
+        offset=[0.0],
+        clipped=[0.0],
+        blind=[0.0],
+    )
+
+
+def sensorless_step(
+    c: SensorlessCoefficients, s: SensorlessState, reference: float, temperature_degc: float
+) -> float:
+    """Return the voltage (V) for the reference (m) of this sample at a surface temperature (°C).
+
+    A temperature that is NaN is one that is missing: the body keeps the temperature it has, and `blind`
+    counts the sample.
+    """
+    wanted = shape(c.taps, s.past, reference) + s.offset[0]
+    warmth = s.body.degc[0] - REFERENCE_DEGC
+    heat(c, s, temperature_degc)
+    left = 0.0
+    released = 0.0
+    for i in range(len(s.relaxations)):
+        left += c.creep.retained[i] * s.relaxations[i]
+        released += c.creep.released[i]
+    stroke = 1.0 + c.thermal.gain_per_degc * warmth
+    softening = c.thermal.lag_per_degc * warmth
+    released *= max(0.0, c.creep.gain + c.creep.gain_per_degc * warmth)
+    ideal = operator_inverse(
+        c.operator,
+        s.hysteresis,
+        wanted - thermal_deflection(c.thermal, s.body) - left,
+        stroke * (1.0 + softening),
+        released - stroke * softening * c.thermal.slope,
+    )
+    voltage = limited(c.low, c.high, c.step_limit, s.hysteresis.voltage[0], ideal)
+    if voltage != ideal:
+        s.clipped[0] += 1.0
+    operator_step(c.operator, s.hysteresis, voltage)
+    creep_step(c.creep, s.relaxations, voltage, warmth)
+    return voltage
+
+
+def heat(c: SensorlessCoefficients, s: SensorlessState, temperature_degc: float) -> None:
+    """Let the body follow the surface by one sample, or keep its temperature where there is none."""
+    if temperature_degc == temperature_degc:  # not NaN
+        warm(c.thermal, s.body, min(max(temperature_degc, c.coldest), c.warmest))
+    else:
+        s.blind[0] += 1.0
+
+
+class Sensorless:
+    """The law of one finger at a fixed `sample_time` (s), from rest at `temperature_degc`.
+
+    >>> law = Sensorless(SensorlessParameters(), sample_time=1e-4, temperature_degc=22.0)
+    >>> for _ in range(40):
+    ...     voltage = law.step(10e-6, 22.0)
+    >>> abs(law.predicted - 10e-6) < 1e-18
+    True
+    """
+
+    def __init__(
+        self, parameters: SensorlessParameters, sample_time: float, temperature_degc: float
+    ) -> None:
+        self.coefficients = sensorless_coefficients(parameters, sample_time)
+        self.delay = shaping.delay(self.coefficients.taps, sample_time)
+        self.state = sensorless_rest(self.coefficients, temperature_degc)
+        self.predicted = 0.0
+
+    def step(self, reference: float, temperature_degc: float) -> float:
+        """Return the voltage (V) for the reference (m) of this sample; NaN is a missing temperature.
+
+        Raises ValueError when the reference is not finite or the temperature infinite; nothing changes.
+        """
+        if not math.isfinite(reference) or math.isinf(temperature_degc):
+            raise ValueError(
+                f"reference is {reference!r} m, temperature is {temperature_degc!r} °C; must be finite"
+            )
+        warmth = self.state.body.degc[0] - REFERENCE_DEGC
+        voltage = sensorless_step(self.coefficients, self.state, reference, temperature_degc)
+        self._predict(voltage, warmth)
+        return voltage
+
+    def follow(self, voltage: float, temperature_degc: float) -> None:
+        """Take note of a sample whose `voltage` (V) another law chose: feedback, a ramp to rest."""
+        c, s = self.coefficients, self.state
+        warmth = s.body.degc[0] - REFERENCE_DEGC
+        heat(c, s, temperature_degc)
+        operator_step(c.operator, s.hysteresis, voltage)
+        creep_step(c.creep, s.relaxations, voltage, warmth)
+        self._predict(voltage, warmth)
+
+    def take_over(self, reference: float) -> None:
+        """Go on from here at `reference` (m) without a bump.
+
+        What the models are wrong by at this moment is added to the reference from now on.
+        """
+        self.state.past[:] = [reference] * len(self.state.past)
+        self.state.offset[0] = self.predicted - reference
+
+    def _predict(self, voltage: float, warmth: float) -> None:
+        """Take down the static deflection (m) that the models expect at the end of the sample."""
+        c, s = self.coefficients, self.state
+        plays = zip(c.operator.weights, s.hysteresis.plays, strict=True)
+        static = sum(weight * play for weight, play in plays)
+        drift = thermal_deflection(c.thermal, s.body) + sum(s.relaxations)
+        self.predicted = heated(c.thermal, static, voltage, warmth) + drift

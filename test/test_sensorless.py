@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The sensorless law on fingers that are its model, and what it does when inputs are missing or limited."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from piezo_control.creep import CreepParameters
+from piezo_control.hysteresis import Hysteresis, HysteresisParameters, operator_inverse
+from piezo_control.parameters import ParameterError
+from piezo_control.profile import Profile
+from piezo_control.sensorless import Sensorless, SensorlessParameters
+from piezo_control.shaping import ShapingParameters
+from piezo_control.thermal import ThermalParameters
+from piezo_sim import engine
+from piezo_sim.plant.cantilever import CantileverParameters
+from piezo_sim.temperature import TemperatureParameters
+
+H = 1e-4
+UNLIMITED = {"slew_limit": 1e6}
+STEP = Profile([0.0, 0.1], [0.0, 20e-6])
+WARMING = TemperatureParameters(profile="ramp", start=1.0, duration=20.0, amplitude_degc=10.0)
+
+
+@given(
+    st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=8),
+    st.floats(-40.0, 40.0),
+    st.floats(0.5, 2.0),
+    st.floats(-1e-7, 1e-7),
+)
+def test_operator_inverse_solves_its_equation(past, voltage, scale, line):
+    """At any state of the plays, scale and line: the voltage comes back from scale H(u) + line u."""
+    actuator = Hysteresis(HysteresisParameters())
+    actuator(past)
+    probe = Hysteresis(HysteresisParameters(), plays=actuator.state.plays)
+    value = scale * probe.step(voltage) + line * voltage
+    found = operator_inverse(actuator.coefficients, actuator.state, value, scale, line)
+    assert found == pytest.approx(voltage, abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "temperatures",
+    [TemperatureParameters(), TemperatureParameters(base_degc=32.0), WARMING],
+    ids=["22", "32", "ramp"],
+)
+def test_nothing_is_left_of_creep_and_heat_on_a_finger_that_is_the_model(temperatures):
+    run = engine.run_sensorless(
+        CantileverParameters(), SensorlessParameters(), temperatures, STEP, 300_000, every=10
+    )
+    error = np.abs(run.true_deflection - run.reference)
+    # Vibration is over. The voltage that undoes creep reaches the tip through D(s), late by its a1 = 8 µs:
+    # at 32 °C creep is a few µm/s at first.
+    assert np.max(error[run.time > 0.4]) < 5e-11
+
+
+@pytest.mark.parametrize("resonance", [0.9, 0.95, 1.0, 1.05, 1.1])
+def test_a_step_of_20_um_is_within_5_percent_after_2_ms_for_any_resonance_of_the_box(resonance):
+    plant = CantileverParameters()
+    a2, a1, a0 = plant.dynamics.denominator
+    dynamics = type(plant.dynamics)(denominator=(a2 / resonance**2, a1 / resonance, a0))
+    run = engine.run_sensorless(
+        CantileverParameters(dynamics=dynamics), SensorlessParameters(**UNLIMITED),
+        TemperatureParameters(), STEP, 3000,
+    )  # fmt: skip
+    late = run.time >= 0.102 - 1e-9
+    assert np.max(np.abs(run.true_deflection - 20e-6)[late]) <= 0.05 * 20e-6
+
+
+def test_without_the_models_creep_and_heat_show():
+    nothing = SensorlessParameters(
+        creep=CreepParameters(gain=0.0, gain_per_degc=0.0),
+        thermal=ThermalParameters(sensitivity=0.0, gain_per_degc=0.0, lag_per_degc=0.0),
+    )
+    run = engine.run_sensorless(CantileverParameters(), nothing, WARMING, STEP, 300_000, every=10)
+    assert np.max(np.abs(run.true_deflection - run.reference)[run.time > 0.4]) > 1e-6
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(st.tuples(st.floats(-25e-6, 25e-6), st.floats(10.0, 45.0)), max_size=40))
+def test_it_is_exact_again_after_limits_and_any_temperature(history):
+    """The models follow the voltage that was applied, so the prediction is the plant's static deflection."""
+    parameters = SensorlessParameters(shaping=ShapingParameters(kind="none"))
+    law = Sensorless(parameters, H, 22.0)
+    for reference, degc in history:
+        assert -40.0 <= law.step(reference, degc) <= 40.0
+    for _ in range(25):  # 4 V a sample over 80 V, at most
+        law.step(5e-6, 22.0)
+    assert law.predicted == pytest.approx(5e-6, abs=1e-17)
+
+
+def test_limits_of_voltage_and_slew_hold_and_are_counted():
+    law = Sensorless(SensorlessParameters(shaping=ShapingParameters(kind="none")), H, 22.0)
+    voltages = [0.0, *(law.step(100e-6, 22.0) for _ in range(20))]
+    assert max(voltages) == 40.0
+    assert np.max(np.abs(np.diff(voltages))) == pytest.approx(4.0)
+    assert law.state.clipped == [20.0]
+
+
+def test_a_missing_temperature_is_counted_and_the_last_one_goes_on():
+    laws = [Sensorless(SensorlessParameters(), H, 30.0) for _ in range(2)]
+    for _ in range(100):
+        assert laws[0].step(5e-6, math.nan) == laws[1].step(5e-6, 30.0)
+    assert laws[0].state.blind == [100.0]
+    assert laws[1].state.blind == [0.0]
+
+
+def test_it_takes_over_in_mid_run_without_a_bump():
+    law = Sensorless(SensorlessParameters(), H, 22.0)
+    for k in range(1000):
+        law.follow(30.0 * math.sin(k / 200.0), 25.0)
+    before = law.state.hysteresis.voltage[0]
+    law.take_over(
+        reference=9e-6
+    )  # feedback said 9 µm; the models, not quite right, say something else
+    first = [law.step(9e-6, 25.0) for _ in range(100)]
+    # Only heat and creep of 10 ms move it.
+    assert np.max(np.abs(np.array(first) - before)) < 0.2
+    assert law.state.clipped == [0.0]
+
+
+def test_it_is_the_same_law_compiled():
+    pytest.importorskip("numba")
+    runs = [
+        engine.run_sensorless(
+            CantileverParameters(), SensorlessParameters(), WARMING, STEP, 2000, compiled=compiled
+        )
+        for compiled in (False, True)
+    ]
+    np.testing.assert_array_equal(runs[0].voltage, runs[1].voltage)
+
+
+@pytest.mark.parametrize(
+    "parameters, message",
+    [
+        ({"thermal": ThermalParameters(lag_per_degc=0.02), "temperature_high": 150.0}, "150 °C"),
+        ({"hysteresis": HysteresisParameters(rate_coefficient=1e-5)}, "rate-dependent"),
+    ],
+)
+def test_models_without_an_inverse_are_refused(parameters, message):
+    with pytest.raises(ParameterError, match=message):
+        Sensorless(SensorlessParameters(**parameters), H, 22.0)
+
+
+def test_inputs_that_are_no_numbers_are_refused():
+    law = Sensorless(SensorlessParameters(), H, 22.0)
+    for bad in ((math.nan, 22.0), (0.0, math.inf)):
+        with pytest.raises(ValueError, match="must be finite"):
+            law.step(*bad)

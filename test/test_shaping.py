@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shapers against the mode that they are for, stepped exactly."""
+
+import numpy as np
+import pytest
+
+from piezo_control import shaping
+from piezo_control.dynamics import DynamicsParameters, Motion, move, propagator
+from piezo_control.parameters import ParameterError
+from piezo_control.shaping import ShapingParameters, delay, residual_vibration, shape, shaper
+
+H = 1e-4
+A2, A1, _ = DENOMINATOR = DynamicsParameters().denominator
+KINDS = ("zero_vibration", "robust", "least_time")
+
+
+def vibration_after_a_step(taps, resonance=1.0, damping=1.0):
+    """Amplitude of what still moves at the last tap, relative to that of an unshaped step at once."""
+    a2, a1 = A2 / resonance**2, A1 * damping / resonance
+    free = propagator(a2, a1, 1.0, H)
+    amplitudes = []
+    for each in (taps, [1.0]):
+        motion, past = Motion([0.0], [0.0]), [0.0] * len(each)
+        for _ in range(len(taps)):
+            move(motion, free, shape(each, past, 1.0))
+        # The complex amplitude of the mode with the poles p, p*: (v - conj(p) (x - 1)) / (p - conj(p))
+        pole = complex(-0.5 * a1 / a2, np.sqrt(1.0 / a2 - (0.5 * a1 / a2) ** 2))
+        amplitudes.append(abs(motion.v[0] - pole.conjugate() * (motion.x[0] - 1.0)))
+    return amplitudes[0] / amplitudes[1] * np.exp(-0.5 * a1 / a2 * H * (len(taps) - 1))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("resonance, damping", [(0.9, 0.5), (0.97, 1.0), (1.0, 1.5), (1.1, 1.0)])
+def test_the_residual_is_what_the_mode_does(kind, resonance, damping):
+    taps = shaper(ShapingParameters(kind=kind), DENOMINATOR, H)
+    frequency = resonance / (2.0 * np.pi * np.sqrt(A2))
+    ratio = damping * 0.5 * A1 / np.sqrt(A2)
+    expected = residual_vibration(taps, frequency, ratio, H)
+    assert vibration_after_a_step(taps, resonance, damping) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_taps_sum_to_1_and_none_is_negative(kind):
+    taps = np.array(shaper(ShapingParameters(kind=kind), DENOMINATOR, H))
+    assert np.sum(taps) == pytest.approx(1.0, abs=1e-12)
+    assert np.min(taps) >= 0.0
+
+
+@pytest.mark.parametrize("kind", ["zero_vibration", "robust"])
+def test_nothing_is_left_at_the_nominal_mode(kind):
+    taps = shaper(ShapingParameters(kind=kind), DENOMINATOR, H)
+    assert vibration_after_a_step(taps) < 1e-10
+
+
+def test_robust_grows_with_the_square_of_the_deviation():
+    """Convolution squares the residual of zero vibration, Singer and Seering 1990."""
+    frequency = 1.05 / (2.0 * np.pi * np.sqrt(A2))
+    one, two = (
+        residual_vibration(
+            shaper(ShapingParameters(kind=kind), DENOMINATOR, H), frequency, 0.017, H
+        )
+        for kind in ("zero_vibration", "robust")
+    )
+    assert two == pytest.approx(one**2, rel=1e-9)
+
+
+@pytest.mark.parametrize("largest_tap", [0.08, 0.108, 1.0])
+def test_least_time_keeps_its_bound_over_the_box_and_is_shorter_than_2_ms(largest_tap):
+    parameters = ShapingParameters(largest_tap=largest_tap)
+    taps = shaper(parameters, DENOMINATOR, H)
+    assert max(taps) <= largest_tap + 1e-9
+    assert len(taps) <= 20
+    frequency = np.linspace(0.9, 1.1, 301)[:, None] / (2.0 * np.pi * np.sqrt(A2))
+    ratio = np.linspace(0.5, 1.5, 7) * 0.5 * A1 / np.sqrt(A2)
+    assert np.max(residual_vibration(taps, frequency, ratio, H)) <= 0.05
+
+
+def test_a_ramp_comes_late_by_the_delay():
+    taps = shaper(ShapingParameters(), DENOMINATOR, H)
+    past = [0.0] * len(taps)
+    ramp = [shape(taps, past, k * H) for k in range(50)]
+    assert ramp[-1] == pytest.approx(49 * H - delay(taps, H), abs=1e-15)
+
+
+def test_what_cannot_be_shaped_is_refused(monkeypatch):
+    with pytest.raises(ParameterError, match="half the sampling rate"):
+        shaper(ShapingParameters(), DENOMINATOR, 1e-3)
+    monkeypatch.setattr(shaping, "LONGEST", 10)
+    with pytest.raises(ParameterError, match="'residual' is 0.05: no shaper up to 10 samples"):
+        shaper(ShapingParameters(), DENOMINATOR, H)
