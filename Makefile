@@ -10,7 +10,7 @@ help:
 	@echo "make paper      every experiment of the paper; results in out/paper"
 	@echo "make figures    the same, and the pictures of the README in docs/"
 	@echo "make bench      speed of the loop; results in out/bench.json"
-	@echo "make lint       ruff only"
+	@echo "make lint       ruff and mypy"
 	@echo "make faults     a thousand random schedules of faults on live nodes; prints the seeds that fail"
 	@echo "make coverage   the tests once more, and the lines that none of them reaches"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
@@ -35,7 +35,7 @@ test: lint
 	$(RUN) python -m pytest
 
 lint: env
-	$(RUN) ruff check . && ruff format --check .
+	$(RUN) ruff check . && ruff format --check . && mypy
 
 faults: env
 	$(RUN) python test/faults.py

@@ -23,6 +23,9 @@ from typing import NamedTuple
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
 
+SMALLEST = 1e-9
+"""Slowest speed (m/s) and least force (N) of a goal: less is a mistake, no motion."""
+
 
 @dataclass(frozen=True)
 class GripperParameters:
@@ -99,8 +102,8 @@ def check_goal(
     widest = round(p.rest_opening - 2.0 * p.deflection_low, 12)
     for name, low, high, unit in (
         ("opening", narrowest, widest, "m"),
-        ("max_force", 0.0, p.force_limit, "N"),
-        ("speed", 0.0, p.speed_limit, "m/s"),
+        ("max_force", SMALLEST, p.force_limit, "N"),
+        ("speed", SMALLEST, p.speed_limit, "m/s"),
     ):
         value = getattr(goal, name)
         if not low <= value <= high:

@@ -16,6 +16,7 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -93,8 +94,11 @@ def temperature(parameters: TemperatureParameters, first: int, count: int) -> np
     return p.base_degc + p.amplitude_degc * _shape(p, time - p.start)
 
 
-def grid_index(sample: np.ndarray | int, sample_time: float, period: float) -> np.ndarray | int:
-    """Return which grid value holds at sample * sample_time; exact, in whole nanoseconds."""
+def grid_index(sample: Any, sample_time: float, period: float) -> Any:
+    """Return which grid value holds at sample * sample_time; exact, in whole nanoseconds.
+
+    `sample` is a number or an integer array; the result is alike.
+    """
     return sample * round(sample_time * 1e9) // round(period * 1e9)
 
 

@@ -23,7 +23,7 @@ def test_amplitudes_fall_linearly_to_zero():
 def test_sweep_homes_a_finger_whatever_its_past(past):
     """Full amplitude wipes the past out; what is left is half the last amplitude step."""
     actuator = Hysteresis(HysteresisParameters())
-    law = Feedforward(FeedforwardParameters(), 1e-3)  # knows nothing of the past
+    law = Feedforward(FeedforwardParameters(slew_limit=1e6), 1e-3)  # knows nothing of the past
     actuator(past)
     for voltage in decaying_sine(40.0, cycles=20).value.tolist():
         deflection = actuator.step(voltage)

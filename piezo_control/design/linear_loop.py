@@ -68,7 +68,14 @@ def fingers(
     )
     b_force = (np.eye(2) - a)[:, :, 0]
     return Fingers(
-        a, factors[:, 2:] * b_force, b_force, *factors.T, sample_time=sample_time, delay=delay
+        a=a,
+        b=factors[:, 2:] * b_force,
+        b_force=b_force,
+        resonance=factors[:, 0],
+        damping=factors[:, 1],
+        gain=factors[:, 2],
+        sample_time=sample_time,
+        delay=delay,
     )
 
 

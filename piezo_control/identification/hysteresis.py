@@ -324,10 +324,16 @@ class _Problem:
                 (-changes[lower])[::-1].tolist(),
             )
         )
+        upper_thresholds, upper_weights, lower_thresholds, lower_weights = map(
+            tuple, dead_zones[3:]
+        )
         parameters = HysteresisParameters(
             tuple(self.thresholds.tolist()),
             tuple(weights.tolist()),
-            *(tuple(entry) for entry in dead_zones[3:]),
+            upper_thresholds,
+            upper_weights,
+            lower_thresholds,
+            lower_weights,
         )
         model = HysteresisModel(parameters, self.middle + origin, lag, smoothness)
         measurement = self.measurement

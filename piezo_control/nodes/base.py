@@ -143,7 +143,7 @@ class FingerNode(LifecycleNode):
         # Every transition goes through this method of rclpy's mixin, which lets an impossible one end the
         # process. A client that asks for one gets "no" instead.
         try:
-            return super()._LifecycleNodeMixin__change_state(transition_id)
+            return super()._LifecycleNodeMixin__change_state(transition_id)  # type: ignore[misc]
         except RCLError:
             self.get_logger().warning(f"transition {transition_id} is not possible in this state")
             return TransitionCallbackReturn.FAILURE
@@ -196,7 +196,7 @@ class FingerNode(LifecycleNode):
             reason = f"{', '.join(sorted(frozen))}: deactivate '{self.NAME}' first"
             return SetParametersResult(successful=False, reason=reason)
         try:
-            wanted = build(self.PARAMETERS, self._values(ours))
+            wanted: Any = build(self.PARAMETERS, self._values(ours))
             if ours:
                 self.check(wanted)
         except ValueError as error:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from time import monotonic
+from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
@@ -94,7 +95,7 @@ class Finger:
         self._on_state = on_state
         self.name = name
         self.index = index
-        self.state: FingerState | None = None
+        self.state: Any = None  # FingerState; None before the first
         self.reference: Profile | None = None
         self.heard = monotonic()
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
@@ -156,9 +157,9 @@ class GripperNode(FingerNode):
     def __init__(self) -> None:
         super().__init__()
         self.fingers: list[Finger] = []
-        self.goal: ServerGoalHandle | None = None
+        self.goal: Any = None  # ServerGoalHandle; None when there is no goal
         self.motion: Motion | None = None
-        self.watchdog = self.create_timer(WATCH_PERIOD, self._watch, autostart=False)
+        self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
         self.server = DeferredActionServer(
             self, Grip, "grip", ServerGoalHandle.abort,
             goal_callback=self._on_goal,
@@ -227,10 +228,9 @@ class GripperNode(FingerNode):
         elif self.goal.is_cancel_requested:
             self._halt_goal(ServerGoalHandle.canceled, failure("canceled"))
         else:
-            self._go_on(finger)
+            self._go_on(finger, motion)
 
-    def _go_on(self, finger: Finger) -> None:
-        motion = self.motion
+    def _go_on(self, finger: Finger, motion: Motion) -> None:
         if not motion.departed(finger.index):
             finger.follow(motion.depart(finger.index, finger.time, finger.place()))
         opening, force = self._measured()

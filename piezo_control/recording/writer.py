@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import (
@@ -75,7 +76,7 @@ class BagWriter:
 
         Raises OSError when the disk does not take it.
         """
-        storage = self._writer.storage
+        storage: Any = self._writer.storage  # rosbags' own MCAP writer; other kinds have no chunks
         if storage.chunk.msgs:
             storage.close_chunk()
         storage.bio.flush()

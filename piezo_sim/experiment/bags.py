@@ -75,10 +75,8 @@ def compare_bags(found: Mapping[str, Recording], kind: str | None, out: Path) ->
 
 
 def _difference(row: Figures, first: Figures) -> Figures:
-    return {
-        quantity: None if value is None or first[quantity] is None else value - first[quantity]
-        for quantity, value in row.items()
-    }
+    pairs = {quantity: (value, first[quantity]) for quantity, value in row.items()}
+    return {q: None if a is None or b is None else a - b for q, (a, b) in pairs.items()}
 
 
 def _figures(name: str, recording: Recording, kind: str | None) -> tuple[str, Figures]:

@@ -77,7 +77,7 @@ def growth(
 
 def magnitude_change(results: Sequence[Result]) -> Values:
     """Return the largest difference in dB, up to the cut-off, of the magnitude at two temperatures."""
-    bands: dict[float, list[Result]] = {}
+    bands: dict[float | int | None, list[Result]] = {}
     for r in results:
         if r.run.case.analysis == "frequency":
             bands.setdefault(r.figures["lowest_rad_s"], []).append(r)

@@ -55,8 +55,7 @@ def print_table(console: Console, section: Section) -> None:
     )
     for column in section.columns:
         is_first = column == section.columns[0]
-        justify = "left" if is_first else "right"
-        table.add_column(escape(column), justify=justify, no_wrap=is_first)
+        table.add_column(escape(column), justify="left" if is_first else "right", no_wrap=is_first)
     for row in section.rows:
         table.add_row(*map(escape, row))
     console.print(table)

@@ -155,7 +155,9 @@ def metrics(results: Sequence[Result], out: Path) -> dict[str, Any]:
         }
         for r in results
     ]
-    warm_ups = [r for r in rows if r["experiment"] == "step" and r["name"].startswith("thermal_")]
+    warm_ups = [
+        r for r in rows if r["experiment"] == "step" and str(r["name"]).startswith("thermal_")
+    ]
     content: dict[str, Any] = {"cases": rows}
     if len(warm_ups) == 1:
         content = {"cases": [r for r in rows if r not in warm_ups], "thermal_step": warm_ups[0]}

@@ -18,6 +18,7 @@ both; a sensor zeroed at 0 V behind a negative excursion explains 26 of the 30 Â
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -225,7 +226,7 @@ class Cantilever:
         """Go back to sample 0: at rest, 0 V, random draws from the seed."""
         self._state = rest(self._model, self.parameters.sensor.delay_samples, REFERENCE_DEGC)
         self._generators = generators(self.parameters.seed)
-        self._draws = iter(())
+        self._draws: Iterator[tuple[float, float]] = iter(())
         self.samples = 0
         self._look()
 
