@@ -2,13 +2,14 @@
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
 
-.PHONY: help env demo paper figures bench test lint coverage faults clean distclean
+.PHONY: help env demo paper figures sensorless bench test lint coverage faults clean distclean
 
 help:
 	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
 	@echo "make test       lint and all tests"
 	@echo "make paper      every experiment of the paper; results in out/paper"
 	@echo "make figures    the same, and the pictures of the README in docs/"
+	@echo "make sensorless what the models do without a sensor; results in out/sensorless"
 	@echo "make bench      speed of the loop; results in out/bench.json"
 	@echo "make lint       ruff and mypy"
 	@echo "make faults     a thousand random schedules of faults on live nodes; prints the seeds that fail"
@@ -27,6 +28,9 @@ paper: env
 
 figures: paper
 	$(RUN) python docs/figures.py out/paper
+
+sensorless: env
+	$(RUN) python -m piezo_sim.experiment.sensorless --out out/sensorless
 
 bench: env
 	$(RUN) python bench/run.py --out out/bench.json

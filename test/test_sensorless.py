@@ -16,6 +16,7 @@ from piezo_control.sensorless import Sensorless, SensorlessParameters
 from piezo_control.shaping import ShapingParameters
 from piezo_control.thermal import ThermalParameters
 from piezo_sim import engine
+from piezo_sim.experiment import sensorless as study
 from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
@@ -76,6 +77,17 @@ def test_without_the_models_creep_and_heat_show():
     )
     run = engine.run_sensorless(CantileverParameters(), nothing, WARMING, STEP, 300_000, every=10)
     assert np.max(np.abs(run.true_deflection - run.reference)[run.time > 0.4]) > 1e-6
+
+
+def test_the_truth_plant_is_held_within_2_percent_by_models_identified_from_recordings():
+    """Of another class than the models; 300 s while it warms up by 10 °C, and 5 % after a step and 2 ms."""
+    plant = CantileverParameters(plant="truth")
+    models = study.identified(plant)
+    warming = study.warming(10.0, 60.0)
+    assert study.hold_error(plant, models, warming) <= 0.02 * study.STROKE
+    assert study.step_error(plant, models) <= 0.05 * study.STEP
+    alone = dict(study.stages(models))["hysteresis"]
+    assert study.hold_error(plant, alone, warming) > 0.15 * study.STROKE
 
 
 @settings(deadline=None, max_examples=30)
