@@ -28,7 +28,6 @@ def generate_launch_description() -> LaunchDescription:
                 package="piezo_gripper",
                 executable="gripper",
                 parameters=[
-                    PathJoinSubstitution([share, "params", "gripper.yaml"]),
                     {
                         "fingers": list(FINGERS),
                         "sample_time": LaunchConfiguration("sample_time"),

@@ -25,7 +25,7 @@ from piezo_control.design.cli import main, read_problem
 from piezo_control.design.problem import DesignProblem, Uncertainty
 from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters
-from piezo_control.parameters import build, load
+from piezo_control.parameters import build, declarations, load
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"
 
@@ -292,3 +292,25 @@ def test_an_identified_finger_replaces_that_of_the_problem(tmp_path):
     assert p.finger.denominator == (6e-8, 9e-6, 1.0)
     assert p.finger.sample_time == 5e-5
     assert p.finger.delay_samples == 1
+
+
+def test_reach_and_drift_are_those_of_the_identified_finger(tmp_path):
+    """One play without threshold, 1 µm/V within −10 to 20 V: −10 to 20 µm; 2e-7 + 0.01 * 20 µm per degree."""
+    plant = {
+        "hysteresis": {"thresholds": [0.0], "weights": [1e-6]},
+        "amplifier": {"voltage_low": -10.0, "voltage_high": 20.0},
+        "thermal": {"sensitivity": 2e-7, "gain_per_degc": 0.01},
+    }
+    identified = tmp_path / "cantilever.yaml"
+    identified.write_text(yaml.safe_dump({"/**/cantilever": {"ros__parameters": plant}}))
+    p = read_problem(PARAMS / "synthesis_robust.yaml", identified)
+    assert (p.finger.command_low, p.finger.command_high) == pytest.approx((-10e-6, 20e-6))
+    assert p.finger.drift_per_degc == pytest.approx(4e-7)
+
+
+@pytest.mark.parametrize("path", sorted(PARAMS.glob("s*.yaml")), ids=lambda path: path.name)
+def test_problems_say_only_what_differs_from_the_default(path):
+    known = declarations(DesignProblem)
+    values = load(path, "synthesize")
+    repeated = [n for n, v in values.items() if v == known[n][1].default]
+    assert [name for name in repeated if name != "name"] == []

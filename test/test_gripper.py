@@ -158,7 +158,7 @@ class Bench:
         self.processes = {}
         for side in SIDES:
             self._start(side, "finger", folder, files, "-r", f"__ns:=/{side}")
-        self._start("gripper", "gripper", folder, [params_folder() / "gripper.yaml"])
+        self._start("gripper", "gripper", folder, [])
         self.node = rclpy.create_node("client")
         self.executor = EventsExecutor()
         self.executor.add_node(self.node)

@@ -19,6 +19,7 @@ import math
 import os
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,22 @@ from piezo_control.design.certificate import Certificate, Row, certify  # noqa: 
 from piezo_control.design.problem import DesignProblem  # noqa: E402
 from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
 from piezo_control.feedback import FeedbackParameters  # noqa: E402
-from piezo_control.parameters import ParameterError, build, dump, flatten, load  # noqa: E402
+from piezo_control.hysteresis import (  # noqa: E402
+    HysteresisParameters,
+    coefficients,
+    reachable_range,
+)
+from piezo_control.parameters import (  # noqa: E402
+    ParameterError,
+    T,
+    build,
+    declarations,
+    dump,
+    flatten,
+    load,
+)
+from piezo_control.safety import VoltageParameters  # noqa: E402
+from piezo_control.thermal import ThermalParameters  # noqa: E402
 
 
 def main() -> int:
@@ -70,7 +86,10 @@ def main() -> int:
 
 
 def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
-    """Read a design problem; D(s), sample time and sensor delay from `cantilever` when given.
+    """Read a design problem; all that depends on the finger from `cantilever` when given.
+
+    That is D(s), sample time and sensor delay, the reach within the limits of the voltage, and how far a
+    degree moves the tip: by the thermal deflection, and by the change of the stroke at the end of the reach.
 
     Raises ParameterError naming file and value.
     """
@@ -86,7 +105,28 @@ def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
         values.update(
             {ours: identified[theirs] for theirs, ours in names.items() if theirs in identified}
         )
+        values.update(_of_reach_and_heat(identified, str(cantilever)))
     return build(DesignProblem, values, str(path))
+
+
+def _of_reach_and_heat(identified: Mapping[str, Any], source: str) -> dict[str, float]:
+    """Return command range and drift of a finger from the parameters of its cantilever."""
+
+    def part(cls: type[T], name: str) -> T:
+        known = declarations(cls)
+        values = {n: identified[f"{name}.{n}"] for n in known if f"{name}.{n}" in identified}
+        return build(cls, values, source)
+
+    voltage = part(VoltageParameters, "amplifier")
+    operator = coefficients(part(HysteresisParameters, "hysteresis"), sample_time=1.0)
+    low, high = reachable_range(operator, voltage.voltage_low, voltage.voltage_high)
+    thermal = part(ThermalParameters, "thermal")
+    drift = thermal.sensitivity + abs(thermal.gain_per_degc) * max(-low, high)
+    return {
+        "finger.command_low": low,
+        "finger.command_high": high,
+        "finger.drift_per_degc": drift,
+    }
 
 
 def write_report(

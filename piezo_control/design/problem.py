@@ -8,8 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from piezo_control.dynamics import DynamicsParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError, group, parameter
 
+REACH = Feedforward(FeedforwardParameters(), sample_time=1e-4).reachable_range
+"""Of the default finger (m)."""
 METHODS = ("hinf", "given", "pid", "integrator_notch")
 
 
@@ -18,12 +22,14 @@ class FingerModel:
     """The linear finger: D(s), sensor delay, reachable range and slow disturbances."""
 
     denominator: tuple[float, ...] = parameter(
-        (5.7e-8, 8.1e-6, 1.0), "denominator of D(s), highest power first; D(0) = 1", low=0.0
+        DynamicsParameters().denominator,
+        "denominator of D(s), highest power first; D(0) = 1",
+        low=0.0,
     )
     sample_time: float = parameter(1e-4, "sample time of the loop", unit="s", low=1e-6, high=0.1)
     delay_samples: int = parameter(1, "samples from deflection to reading", low=0, high=10)
-    command_low: float = parameter(-22e-6, "lowest reachable deflection", unit="m")
-    command_high: float = parameter(22e-6, "highest reachable deflection", unit="m")
+    command_low: float = parameter(REACH[0], "lowest reachable deflection", unit="m")
+    command_high: float = parameter(REACH[1], "highest reachable deflection", unit="m")
     drift_per_degc: float = parameter(
         2.7e-7,
         "open-loop deflection per degree: thermal offset, and change of the stroke at full deflection",
