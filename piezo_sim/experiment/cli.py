@@ -87,6 +87,10 @@ def run_into(
     if arguments.command == "all":
         sections.insert(0, paper.section(found))
         content["paper"] = paper.compare(found)
+        from piezo_sim.experiment import sensorless  # scipy, for `all` alone
+
+        content["sensorless"], tables = sensorless.study()
+        sections += tables
     results.write_metrics(content, out)
     write_html(out / "report.html", title, sections, results.footer(content, len(found)))
     print_tables(console, sections)

@@ -45,7 +45,8 @@ PLAYS = 16
 SLOW = 1e-2  # s, sample time of the recordings for creep and heat
 QUICK = 1e-3  # s, of the one for hysteresis
 TEXT = (
-    "Models identified from recordings of the finger, and no sensor in the loop. Errors of the true tip; "
+    "Computed by the engine, not from bags: models identified from recordings of the finger, and no sensor "
+    "in the loop. Errors of the true tip; "
     "step and hold follow one cycle of a sine, sines start from rest and are known ahead by the delay."
 )
 NO_CREEP = CreepParameters(gain=0.0, gain_per_degc=0.0)
@@ -175,23 +176,30 @@ def errors(
             yield f"{frequency:g} Hz, {degc:g} °C [% of stroke]", 100.0 * error / STROKE
 
 
+def study() -> tuple[dict[str, dict[str, dict[str, float]]], list[Section]]:
+    """Identify both plants and run all stages; return the errors (%) and a table for each plant."""
+    found = {}
+    sections = []
+    for kind in PLANTS:
+        plant = CantileverParameters(plant=kind)
+        models = identified(plant)
+        by_stage = {name: dict(errors(plant, stage)) for name, stage in stages(models)}
+        names = list(next(iter(by_stage.values())))
+        rows = [[n, *(f"{stage[n]:.2f}" for stage in by_stage.values())] for n in names]
+        title = f"Without a sensor, plant {kind}"
+        sections.append(Section(title, TEXT, columns=["largest error", *by_stage], rows=rows))
+        found[kind] = by_stage
+    return found, sections
+
+
 def main() -> int:
-    """Run the command line: identify both plants, run all stages, write table and parameter files."""
+    """Run the command line: write metrics.json and report.html, print the tables."""
     parser = argparse.ArgumentParser(
         prog="python -m piezo_sim.experiment.sensorless", description=__doc__.splitlines()[0]
     )
     parser.add_argument("--out", type=Path, default=Path("out/sensorless"))
     out = parser.parse_args().out
-    found: dict[str, dict[str, dict[str, float]]] = {}
-    sections = []
-    for kind in PLANTS:
-        plant = CantileverParameters(plant=kind)
-        models = identified(plant)
-        found[kind] = {name: dict(errors(plant, stage)) for name, stage in stages(models)}
-        names = list(next(iter(found[kind].values())))
-        rows = [[n, *(f"{stage[n]:.2f}" for stage in found[kind].values())] for n in names]
-        title = f"Without a sensor, plant {kind}"
-        sections.append(Section(title, TEXT, columns=["largest error", *found[kind]], rows=rows))
+    found, sections = study()
     out.mkdir(parents=True, exist_ok=True)
     (out / "metrics.json").write_text(json.dumps(found, indent=2, ensure_ascii=False))
     write_html(out / "report.html", "Without a sensor", sections)
