@@ -53,6 +53,12 @@ class Profile:
                 f"{self.time[i]:g} s; must increase"
             )
 
+    def part(self, begin: float, end: float) -> Profile:
+        """Return the profile between two instants (s); it stays where it is at the end."""
+        inside = self.time[(self.time > begin) & (self.time < end)]
+        times = np.array([begin, *inside, end])
+        return Profile(times, self.at(times), self.linear)
+
     def at(self, time: ArrayLike) -> NDArray[np.float64]:
         """Return the values at `time` (s, any shape)."""
         if self.linear:

@@ -44,6 +44,7 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 WATCH_PERIOD = 0.1  # s
 DELIVERY_TIMEOUT = Duration(seconds=0.5)
+LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second
 PHASES = {
     FingerState.IDLE: "IDLE",
     FingerState.WAITING: "WAITING",
@@ -115,6 +116,18 @@ class Finger:
     def follow(self, reference: Profile) -> None:
         """Give the finger this reference."""
         self.reference = reference
+        self.extend()
+
+    def extend(self) -> None:
+        """Send the next piece of the reference.
+
+        A motion goes out in pieces, so that a finger whose gripper is gone stops where the last one ends.
+        """
+        reference = self.reference
+        if reference is None:
+            return
+        if reference.linear:
+            reference = reference.part(self.time, self.time + LEASE)
         self._profiles.publish(
             ProfileMessage(
                 time=reference.time.tolist(),
@@ -233,6 +246,8 @@ class GripperNode(FingerNode):
     def _go_on(self, finger: Finger, motion: Motion) -> None:
         if not motion.departed(finger.index):
             finger.follow(motion.depart(finger.index, finger.time, finger.place()))
+        else:
+            finger.extend()
         opening, force = self._measured()
         self.goal.publish_feedback(Grip.Feedback(opening=opening, force=force))
         states = [f.state for f in self.fingers]
