@@ -9,10 +9,11 @@ descriptors), the YAML files (the layout of ROS parameter files), the engine and
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import fnmatch
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -92,11 +93,21 @@ def build(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
     try:
         for name, value in values.items():
             if name not in known:
-                raise ParameterError(f"unknown parameter '{name}'; known: {', '.join(known)}")
+                raise ParameterError(unknown(name, known))
             check(name, value, *known[name])
         return _build(cls, values)
     except ParameterError as error:
         raise ParameterError(f"{source}: {error}" if source else str(error)) from None
+
+
+def unknown(name: str, known: Iterable[str]) -> str:
+    """Say that there is no parameter `name`, and which one may be meant."""
+    names = list(known)
+    # Of a nested name people know the last part.
+    alike = [n for n in names if n.split(".")[-1] == name]
+    alike = alike or difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean '{alike[0]}'?" if alike else f"known: {', '.join(names)}"
+    return f"unknown parameter '{name}'; {hint}"
 
 
 def _build(cls: type[T], values: Mapping[str, Any]) -> T:

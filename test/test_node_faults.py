@@ -320,6 +320,11 @@ def test_a_wild_voltage_neither_moves_the_tip_nor_goes_unnoticed(neighbour, tmp_
         (["-p", "voltage_high:=1.0e308"], "voltage_high"),
         (["-p", "voltage_high:=[1.0, 2.0]"], "voltage_high"),
         (["-p", "voltage_high:=text"], "voltage_high"),
+        (
+            ["-p", "voltage_hihg:=5.0"],
+            "unknown parameter 'voltage_hihg'; did you mean 'voltage_high'?",
+        ),
+        (["-p", "weights:=[1.0e-7]"], "did you mean 'hysteresis.weights'?"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )

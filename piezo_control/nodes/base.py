@@ -28,7 +28,13 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from piezo_control.nodes import spin
-from piezo_control.parameters import ParameterError, build, declarations
+from piezo_control.parameters import (
+    OF_EVERY_NODE,
+    ParameterError,
+    build,
+    declarations,
+    unknown,
+)
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 
@@ -248,6 +254,7 @@ def run(*node_types: type[FingerNode]) -> int:
         spin.init()
         for node_type in node_types:
             nodes.append(node_type())
+        refuse_unknown(nodes)
         for node in nodes:
             if node.get_parameter("autostart").value:
                 if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -266,6 +273,15 @@ def run(*node_types: type[FingerNode]) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def refuse_unknown(nodes: Sequence[FingerNode]) -> None:
+    """Raise ParameterError for a parameter that was given at start and that none of the `nodes` has."""
+    known = {name: None for node in nodes for name in declarations(node.PARAMETERS)}
+    for node in nodes:
+        for name in node._parameter_overrides:  # rclpy keeps what is not declared, and says nothing
+            if name not in known and name.split(".")[0] not in OF_EVERY_NODE:
+                raise ParameterError(unknown(name, known))
 
 
 def parse(node_types: Sequence[type[FingerNode]]) -> None:
