@@ -15,13 +15,11 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.subscription import Subscription
 
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import LATCHED, NEWEST, SAMPLE
+from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.safety import Guard, is_physical
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import FingerState, Sample
@@ -46,17 +44,6 @@ def wrong_time(sample: Sample, topic: str, parameters: Any, name: str) -> str:
     return ""
 
 
-def publishers(node: Node, topic: str) -> str:
-    """Name the nodes that publish `topic`; the name of one that has just started may not be known yet."""
-    found = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    return ", ".join(
-        "a node just started"
-        if "UNKNOWN" in publisher.node_name
-        else f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
-        for publisher in found
-    )
-
-
 class BlockNode(FingerNode):
     """Subscribe `INPUT`, publish `OUTPUT`; a subclass says what becomes of a value."""
 
@@ -73,10 +60,9 @@ class BlockNode(FingerNode):
         self.guard = Guard(hold_time=1.0)
         self.finger: FingerState | None = None
         self.create_subscription(FingerState, "state", self._on_state, LATCHED)
-        self.publisher_count = 0
-        self._qos: QoSProfile | None = None
-        self._subscription: Subscription | None = None
-        self._listen()
+        self._input = SoleInput(
+            self, self.INPUT, self._on_sample, self._quality(), self._look_for_doubles
+        )
 
     def restart(self) -> None:
         """Take up a new run, before its first sample."""
@@ -98,10 +84,15 @@ class BlockNode(FingerNode):
         self.publish_diagnostics()
 
     def start(self) -> None:
-        self._listen()
+        if self._input.qos is not self._quality():  # the mode was changed
+            self._input.close()
+            self._input = SoleInput(
+                self, self.INPUT, self._on_sample, self._quality(), self._look_for_doubles
+            )
         self.sequence = Sequence(gaps=self.parameters.mode == "free_running")
         self.guard.reset()
-        self._look_for_doubles()
+        if doubles := self._input.doubles():
+            self.trip(doubles)
 
     def reset(self) -> None:
         self.guard.reset()
@@ -113,30 +104,12 @@ class BlockNode(FingerNode):
         figures = {"sample": self.sequence.next - 1, "faults": self.guard.times}
         return self.guard.cause, figures
 
-    def _listen(self) -> None:
-        """Subscribe the input with the quality of service of the mode."""
-        qos = SAMPLE if self.parameters.mode == "lockstep" else NEWEST
-        if qos is self._qos:
-            return
-        if self._subscription:
-            self.destroy_subscription(self._subscription)
-        self._qos = qos
-        self._subscription = self.create_subscription(
-            Sample, self.INPUT, self._on_sample, qos,
-            event_callbacks=SubscriptionEventCallbacks(matched=self._on_matched),
-        )  # fmt: skip
-
-    def _on_matched(self, matched: Any) -> None:
-        self.publisher_count = matched.current_count
-        if self.active:
-            self._look_for_doubles()
+    def _quality(self) -> QoSProfile:
+        return SAMPLE if self.parameters.mode == "lockstep" else NEWEST
 
     def _look_for_doubles(self) -> None:
-        if self.publisher_count > 1:
-            self.trip(
-                f"'{self.resolve_topic_name(self.INPUT)}' has {self.publisher_count} publishers: "
-                f"{publishers(self, self.INPUT)}"
-            )
+        if self.active and (doubles := self._input.doubles()):
+            self.trip(doubles)
 
     def _on_state(self, state: FingerState) -> None:
         self.finger = state

@@ -18,15 +18,15 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import publishers, seconds, wrong_time
+from piezo_control.nodes.block import seconds, wrong_time
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.safety import (
     FAULT,
     HIGHEST_DEGC,
@@ -61,16 +61,12 @@ class CantileverNode(FingerNode):
         self.deflections = self.create_publisher(Sample, "deflection", SAMPLE)
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
-        self.create_subscription(
-            Sample, "voltage", self._on_voltage, SAMPLE,
-            event_callbacks=SubscriptionEventCallbacks(matched=self._on_matched),
-        )  # fmt: skip
+        self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_for_doubles)
         self.create_subscription(Temperature, "temperature", self._on_temperature, SAMPLE)
         self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
         self.create_steady_timer(STATE_PERIOD, self._publish_state)
         self.watchdog = self.create_steady_timer(RETRY_PERIOD, self._watch, autostart=False)
         self.tick = self.create_steady_timer(1.0, self._tick, autostart=False)
-        self.publisher_count = 0
         self.phase = FingerState.IDLE
         self.text = ""
         self.ticks: deque[float] = deque(maxlen=JITTER_WINDOW)
@@ -99,10 +95,11 @@ class CantileverNode(FingerNode):
         self._reset()
         self._enter(FingerState.WAITING)
         self.heard = self.begun = monotonic()
-        self._look_for_doubles()
-        if self.phase == FingerState.FAULT:
-            return
+        if doubles := self.voltages.doubles():
+            self._fault(doubles)
         if self.parameters.mode == "lockstep":
+            if self.guard.is_latched:
+                return
             self.watched = -1
             self.watchdog.reset()
             self._measure()
@@ -149,17 +146,9 @@ class CantileverNode(FingerNode):
     def _limits(self) -> Limits:
         return limits(self.parameters.amplifier, self.parameters.ramp)
 
-    def _on_matched(self, matched: Any) -> None:
-        self.publisher_count = matched.current_count
-        if self.active:
-            self._look_for_doubles()
-
     def _look_for_doubles(self) -> None:
-        if self.publisher_count > 1:
-            self._fault(
-                f"'{self.resolve_topic_name('voltage')}' has {self.publisher_count} publishers: "
-                f"{publishers(self, 'voltage')}"
-            )
+        if self.active and (doubles := self.voltages.doubles()):
+            self._fault(doubles)
 
     # --- lock-step ----------------------------------------------------------------------------------
 
