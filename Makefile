@@ -15,7 +15,7 @@ help:
 	@echo "make faults     a thousand random schedules of faults on live nodes; prints the seeds that fail"
 	@echo "make coverage   the tests once more, and the lines that none of them reaches"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
-	@echo "make clean      remove what was built and the results; distclean: the environment too"
+	@echo "make clean      remove what was built; distclean: the environment and the results too"
 
 env:
 	@tools/bootstrap.sh
@@ -48,7 +48,7 @@ coverage: env
 	$(RUN) coverage erase && coverage run -m pytest && coverage combine --quiet && coverage report
 
 clean:
-	rm -rf build install log out
+	rm -rf build install log
 
 distclean: clean
-	rm -rf .venv
+	rm -rf .venv out

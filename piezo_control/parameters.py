@@ -86,18 +86,31 @@ def flatten(parameters: Any) -> dict[str, Any]:
 def build(cls: type[T], values: Mapping[str, Any], source: str = "") -> T:
     """Build `cls` from ``{dotted name: value}``; what is not named keeps its default.
 
+    A whole number stands for a float, too.
+
     Raises ParameterError, prefixed by `source` (a file or node name), for an unknown name, a wrong
     type, a value out of range, and whatever the dataclass' own ``__post_init__`` refuses.
     """
     known = declarations(cls)
     try:
-        for name, value in values.items():
+        for name in values:
             if name not in known:
                 raise ParameterError(unknown(name, known))
+        values = {name: _promoted(value, known[name][0]) for name, value in values.items()}
+        for name, value in values.items():
             check(name, value, *known[name])
         return _build(cls, values)
     except ParameterError as error:
         raise ParameterError(f"{source}: {error}" if source else str(error)) from None
+
+
+def _promoted(value: Any, kind: type) -> Any:
+    """Return `value` with whole numbers as floats where `kind` asks for floats."""
+    if kind is float and type(value) is int:
+        return float(value)
+    if kind == tuple[float, ...] and isinstance(value, (tuple, list)):
+        return tuple(float(entry) if type(entry) is int else entry for entry in value)
+    return value
 
 
 def unknown(name: str, known: Iterable[str]) -> str:
@@ -133,8 +146,7 @@ def check(name: str, value: Any, kind: type, field: dataclasses.Field) -> None:
     meta = field.metadata
     if kind in (bool, int, float, str):
         if type(value) is not kind:
-            hint = f" (write {value}.0)" if kind is float and type(value) is int else ""
-            raise ParameterError(f"'{name}' is {value!r}, must be of type {kind.__name__}{hint}")
+            raise ParameterError(f"'{name}' is {value!r}, must be of type {kind.__name__}")
         elements: tuple = (value,)
     else:
         element = str if kind == tuple[str, ...] else float

@@ -65,3 +65,27 @@ def test_rubbish_never_ends_in_another_error(tmp_path_factory, data):
     path.write_bytes(data)
     with pytest.raises(ParameterError, match="f.yaml"):
         build(FeedforwardParameters, load(path, "feedforward"), str(path))
+
+
+def test_whole_numbers_stand_for_floats_and_nothing_else_does():
+    made = build(
+        FeedforwardParameters,
+        {"voltage_high": 20, "hysteresis.weights": [1], "hysteresis.thresholds": [0]},
+    )
+    assert type(made.voltage_high) is type(made.hysteresis.weights[0]) is float
+    for value in (True, "20", None, [20.0]):
+        with pytest.raises(ParameterError, match="'voltage_high' is .*, must be of type float"):
+            build(FeedforwardParameters, {"voltage_high": value})
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("voltage_hihg", "voltage_high"),
+        ("weights", "hysteresis.weights"),
+        ("slew_limits", "slew_limit"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_the_nearest(written, meant):
+    with pytest.raises(ParameterError, match=f"'{written}'; did you mean '{meant}'"):
+        build(FeedforwardParameters, {written: 5.0})

@@ -93,6 +93,11 @@ build_packages() {
   find install/piezo_gripper -xtype l -delete
 }
 
+contents() {  # what must still be there the next time: all of install/, and every package in .venv
+  { find install -not -path '*__pycache__*'; find .venv/lib/python3*/site-packages -maxdepth 1; } 2>/dev/null |
+    LC_ALL=C sort
+}
+
 fingerprint() { sha256sum | cut -d ' ' -f 1; }
 
 underlay=wheels
@@ -102,6 +107,11 @@ if [ "${ROS_DISTRO:-}" = jazzy ]; then
   else
     say "ROS_DISTRO is jazzy but /usr/bin/python3 cannot import rclpy: using the wheels"
   fi
+fi
+
+if [[ $root =~ [][[:space:](){}\;:\$\"\'\\#*?\&|\<\>] ]]; then
+  fail "the path of this checkout, '$root', has the character '${BASH_REMATCH[0]}', which the message generators of" \
+    "ROS 2 cannot handle: move it, or clone it again to a plain path"
 fi
 
 # One set-up at a time in one checkout.
@@ -123,7 +133,12 @@ sources=$({
     grep -v __pycache__ | LC_ALL=C sort
   find msg_defs -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
 } | fingerprint)
-if [ "$(cat .venv/pins install/sources 2>/dev/null)" = "$pins"$'\n'"$sources" ]; then
+missing=$([ ! -f log/contents ] || LC_ALL=C comm -23 log/contents <(contents) | head -n 1)
+if [ -n "$missing" ]; then
+  say "'$missing' is gone: building anew what belongs to it"
+  [[ $missing = install* ]] || rm -rf .venv
+  rm -rf build install log/contents
+elif [ "$(cat .venv/pins install/sources 2>/dev/null)" = "$pins"$'\n'"$sources" ]; then
   exit
 fi
 
@@ -136,4 +151,5 @@ if [ "$(cat .venv/pins 2>/dev/null)" != "$pins" ]; then
 fi
 build_packages
 echo "$sources" > install/sources
+contents > log/contents
 say "ready; '. ./setup.bash' gives a shell in which the nodes start by name"
