@@ -335,3 +335,16 @@ def test_unusable_arguments_end_with_one_line(arguments, words):
     )  # fmt: skip
     assert done.returncode == 2
     assert words in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("wait", [0.05, 0.3, 0.8])
+def test_ctrl_c_during_the_start_leaves_no_traceback(wait):
+    """At whatever moment it comes: in Python's own start, the imports, or the node's construction."""
+    process = subprocess.Popen(
+        [EXECUTABLES / "feedforward"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(wait)
+    process.send_signal(signal.SIGINT)
+    words, _ = process.communicate(timeout=TIMEOUT)
+    assert "piezo" not in words and process.returncode in (0, 1, -signal.SIGINT)
