@@ -35,6 +35,7 @@ from piezo_control.gripper import (
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes import spin
 from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
@@ -128,13 +129,7 @@ class Finger:
             return
         if reference.linear:
             reference = reference.part(self.time, self.time + LEASE)
-        self._profiles.publish(
-            ProfileMessage(
-                time=reference.time.tolist(),
-                value=reference.value.tolist(),
-                interpolation=ProfileMessage.LINEAR if reference.linear else ProfileMessage.HOLD,
-            )
-        )
+        self._profiles.publish(to_message(reference))
 
     def problem(self) -> str:
         """Return why the finger cannot move, or nothing."""

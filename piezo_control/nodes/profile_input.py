@@ -12,6 +12,15 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 
 
+def to_message(profile: Profile) -> ProfileMessage:
+    """Return the message that says `profile`."""
+    return ProfileMessage(
+        time=profile.time.tolist(),
+        value=profile.value.tolist(),
+        interpolation=ProfileMessage.LINEAR if profile.linear else ProfileMessage.HOLD,
+    )
+
+
 class ProfileInput:
     """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k."""
 

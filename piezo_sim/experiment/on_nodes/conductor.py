@@ -16,6 +16,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from piezo_control.nodes.base import ROS_TYPES
+from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.parameters import declarations, flatten
 from piezo_control.profile import Profile
@@ -123,9 +124,7 @@ class Conductor:
             lambda: publisher.get_subscription_count() >= 2, SERVICE_TIMEOUT,
             f"a node and the recorder as subscribers of {topic}_profile",
         )  # fmt: skip
-        message = ProfileMessage(time=profile.time.tolist(), value=profile.value.tolist())
-        message.interpolation = ProfileMessage.LINEAR if profile.linear else ProfileMessage.HOLD
-        publisher.publish(message)
+        publisher.publish(to_message(profile))
         publisher.wait_for_all_acked()
 
     def _transition(self, names: Iterable[str], transition: int, verb: str) -> None:
