@@ -341,10 +341,15 @@ def test_unusable_arguments_end_with_one_line(arguments, words):
 def test_ctrl_c_during_the_start_leaves_no_traceback(wait):
     """At whatever moment it comes: in Python's own start, the imports, or the node's construction."""
     process = subprocess.Popen(
-        [EXECUTABLES / "feedforward"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(wait)
-    process.send_signal(signal.SIGINT)
-    words, _ = process.communicate(timeout=TIMEOUT)
+        [EXECUTABLES / "feedforward"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        # Where the tests run in the background, SIGINT may be ignored, and children inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    try:
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(wait)
+        process.send_signal(signal.SIGINT)
+        words, _ = process.communicate(timeout=TIMEOUT)
+    finally:
+        process.kill()
     assert "piezo" not in words and process.returncode in (0, 1, -signal.SIGINT)
