@@ -121,7 +121,7 @@ def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
         neighbour.wait(lambda: voltages and voltages[-1].value > 25.0)
         second = neighbour.node.create_publisher(Sample, "command", SAMPLE)
         neighbour.wait(lambda: voltages[-1].value == 0.0)
-        neighbour.wait(lambda: "'/command' has 2 publishers: /neighbour" in words())
+        neighbour.wait(lambda: "'/command' has 2 publishers: " in words())
         assert not reset(neighbour, "feedforward").success  # they are both still there
         neighbour.node.destroy_publisher(second)
         neighbour.wait(lambda: reset(neighbour, "feedforward").success)
