@@ -302,7 +302,6 @@ def test_canceled_goal_holds_on_the_way(bench):
 def test_new_goal_takes_over_and_the_old_one_is_aborted(bench):
     old = bench.send(10e-6, 0.0, SLOW)
     bench.moving(old)
-    bench.wait(lambda: old.status == GoalStatus.STATUS_EXECUTING)
     new = bench.send(38e-6)
     assert bench.result_of(old.get_result_async()).status == GoalStatus.STATUS_ABORTED
     answer = bench.result_of(new.get_result_async())
