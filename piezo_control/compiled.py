@@ -10,7 +10,7 @@ import inspect
 import os
 import stat
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,8 @@ def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
     import numba
     from numba.extending import register_jitable
 
-    kernels = list(dict.fromkeys(_called(loop)))
+    kernels: list[Callable[..., Any]] = []
+    _collect(loop, kernels)
     for kernel in kernels:
         register_jitable(forceinline=True)(kernel)
     sources = hashlib.sha256()
@@ -52,8 +53,8 @@ def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
         numba.config.CACHE_DIR = before
 
 
-def _called(function: Any) -> Iterator[Any]:
-    """Yield the Python functions that `function` names, directly or as attributes of a module."""
+def _collect(function: Any, kernels: list[Callable[..., Any]]) -> None:
+    """Add the Python functions that `function` names, directly or as attributes of a module."""
     for name in function.__code__.co_names:
         named = function.__globals__.get(name)
         candidates = [named]
@@ -62,9 +63,9 @@ def _called(function: Any) -> Iterator[Any]:
                 getattr(named, attribute, None) for attribute in function.__code__.co_names
             ]
         for candidate in candidates:
-            if inspect.isfunction(candidate):
-                yield candidate
-                yield from _called(candidate)
+            if inspect.isfunction(candidate) and candidate not in kernels:
+                kernels.append(candidate)
+                _collect(candidate, kernels)
 
 
 def _own_folder(name: str) -> Path:

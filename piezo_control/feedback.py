@@ -206,28 +206,47 @@ class Feedback:
     def start(self, reference: float, deflection: float, command: float) -> None:
         """Choose the states so that the next step returns `command` (all in m): no bump.
 
-        The states are those of a constant error that would hold the command, so nothing but the
-        error itself moves the command from there on. Also the way to hand over: build the new
-        controller and start it with the last command of the old one. A controller without states
-        (``none``) has nothing to choose: its command is what its equation says. A command outside
-        the limits is limited first.
+        A controller without states (``none``) has nothing to choose: its command is what its equation
+        says. A command outside the limits is limited first.
 
         Raises ValueError when the controller cannot hold a command (a zero at z = 1).
         """
         p = self.parameters
-        n = p.order
-        if n == 0:
-            return
-        command = min(max(command, p.command_low), p.command_high)
-        system = np.zeros((n + 1, n + 1))
-        system[:n, :n] = np.eye(n) - p.matrix("a")
-        system[:n, n] = -p.matrix("b")
-        system[n, :n] = p.c
-        held = command - p.d * (reference - deflection) - p.reference_d * reference
-        right = np.append(p.matrix("reference_b") * reference, held)
-        try:
-            self.state.x[:] = np.linalg.solve(system, right)[:n].tolist()
-        except np.linalg.LinAlgError:
-            raise ValueError(
-                f"controller '{p.name}' cannot hold a constant command: it has a zero at z = 1"
-            ) from None
+        limited = min(max(command, p.command_low), p.command_high)
+        self.state.x[:] = (hand_over(p) @ (reference, deflection, limited)).tolist()
+
+
+def hand_over(parameters: FeedbackParameters) -> np.ndarray:
+    """Return what the states are made of so that the next step returns a given command.
+
+    The states are those of a constant error that would hold the command, so nothing but the error
+    itself moves the command from there on. Also the way to hand over: build the new controller and start
+    it with the last command of the old one.
+
+    Returns
+    -------
+    2-D array with shape (order, 3)
+        Times (reference, deflection, command), all in m, it is x.
+
+    Raises
+    ------
+    ValueError
+        If the controller cannot hold a constant command (a zero at z = 1).
+    """
+    p = parameters
+    n = p.order
+    if n == 0:
+        return np.zeros((0, 3))
+    system = np.zeros((n + 1, n + 1))
+    system[:n, :n] = np.eye(n) - p.matrix("a")
+    system[:n, n] = -p.matrix("b")
+    system[n, :n] = p.c
+    right = np.zeros((n + 1, 3))
+    right[:n, 0] = p.matrix("reference_b")
+    right[n] = -p.d - p.reference_d, p.d, 1.0
+    try:
+        return np.linalg.solve(system, right)[:n]
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            f"controller '{p.name}' cannot hold a constant command: it has a zero at z = 1"
+        ) from None

@@ -18,6 +18,7 @@ from piezo_control.hysteresis import (
     HysteresisParameters,
     State,
     coefficients,
+    dead_zones,
     inverse_follow,
     inverse_move,
     inverse_voltage,
@@ -85,6 +86,13 @@ def feedforward_step(
     else:
         inverse_follow(c.operator, c.inverse, s.hysteresis, voltage)
     return voltage
+
+
+def modelled_deflection(c: FeedforwardCoefficients, s: FeedforwardState) -> float:
+    """Return the deflection (m) at rest that the model gives to the last voltage and its history."""
+    if not c.inverting:
+        return c.static_gain * s.hysteresis.voltage[0]
+    return dead_zones(c.operator, s.hysteresis.plays[0])  # z'_0 of the inverse is H of the operator
 
 
 class Feedforward:

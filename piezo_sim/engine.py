@@ -177,7 +177,7 @@ def run_sensorless(
     degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
     law = sensorless_coefficients(sensorless, plant.sample_time)
     sampled = cantilever.model(plant)
-    finger = _arrays(
+    finger = as_arrays(
         SensorlessFinger(
             law,
             sensorless_rest(law, degc),
@@ -324,7 +324,7 @@ def finger_at_rest(
     law = feedforward_law.Feedforward(feedforward, plant.sample_time)
     order = feedback.order
     sampled = cantilever.model(plant)
-    return _arrays(
+    return as_arrays(
         Finger(
             feedback_law.feedback_coefficients(feedback),
             FeedbackState([0.0] * order, [0.0] * order),
@@ -336,10 +336,10 @@ def finger_at_rest(
     )
 
 
-def _arrays(tree: Any) -> Any:
+def as_arrays(tree: Any) -> Any:
     """Return nested named tuples with every list turned into a float64 array."""
     if isinstance(tree, tuple):
-        return type(tree)(*map(_arrays, tree))
+        return type(tree)(*map(as_arrays, tree))
     return np.array(tree, dtype=float) if isinstance(tree, list) else tree
 
 

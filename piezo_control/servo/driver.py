@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drivers: how the servo reaches a sensor and an amplifier.
+
+A driver is a shared library with the five functions of ``piezo_driver.h``, given by its path or, if it
+comes with the package (``udp``), by its name. Everything that is called in the loop takes plain addresses,
+so that it compiles with the loop.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from piezo_control.parameters import ParameterError
+
+ABI = 1  # PIEZO_DRIVER_ABI of piezo_driver.h
+
+FRESH, NONE_IN_TIME, FAILED = 0, 1, 2
+"""What reading and writing return: a new sample, none within the time limit, the device is gone."""
+
+SHIPPED = Path(__file__).parent / "drivers"
+
+
+class DriverError(RuntimeError):
+    """A device that cannot be opened; the message is the driver's own."""
+
+
+class Card(NamedTuple):
+    """Addresses of a driver's functions and of its open device; `reading` is where a sample goes."""
+
+    read: int
+    write: int
+    device: int
+    reading: np.ndarray  # deflection in the card's unit, age (s)
+
+
+class SharedLibrary:
+    """A device behind a shared library.
+
+    Raises ParameterError when there is no such library or it lacks a function, DriverError when the device
+    does not open.
+    """
+
+    def __init__(self, driver: str, options: str, sample_time: float) -> None:
+        path = library(driver)
+        try:
+            self._functions = ctypes.CDLL(str(path))
+            abi = self._functions.piezo_driver_abi
+            addresses = [
+                ctypes.cast(getattr(self._functions, name), ctypes.c_void_p).value
+                for name in ("piezo_read", "piezo_write")
+            ]
+            self._functions.piezo_open.restype = ctypes.c_void_p
+            self._functions.piezo_error.restype = ctypes.c_char_p
+            self._functions.piezo_close.restype = None
+        except (OSError, AttributeError) as error:
+            raise ParameterError(f"'driver' is '{driver}': {error}") from None
+        if abi() != ABI:
+            raise ParameterError(f"'driver' is '{driver}', of ABI {abi()}, must be of ABI {ABI}")
+        text = ctypes.create_string_buffer(256)
+        self._device = self._functions.piezo_open(
+            options.encode(), ctypes.c_double(sample_time), text, ctypes.c_size_t(len(text))
+        )
+        if not self._device:
+            raise DriverError(f"driver '{driver}': {text.value.decode(errors='replace')}")
+        read, write = (address or 0 for address in addresses)
+        self.device = Card(read, write, self._device, np.zeros(2))
+        self.read = read_card
+        self.write = write_card
+
+    def error(self) -> str:
+        """Return what went wrong last, in the driver's words."""
+        text = self._functions.piezo_error(ctypes.c_void_p(self._device)) or b""
+        return text.decode(errors="replace")
+
+    def close(self) -> None:
+        """Let go of the device."""
+        self._functions.piezo_close(ctypes.c_void_p(self._device))
+
+
+def library(driver: str) -> Path:
+    """Return the file of a driver that is shipped under this name, or else lies at this path."""
+    shipped = sorted(SHIPPED.glob(f"{driver}*.so")) if "/" not in driver else []
+    path = shipped[0] if shipped else Path(driver)
+    if not path.is_file():
+        known = sorted({p.name.split(".")[0] for p in SHIPPED.glob("*.so")})
+        raise ParameterError(
+            f"'driver' is '{driver}', must be 'simulated', one of the shipped {', '.join(known)}, "
+            "or the path of a shared library"
+        )
+    return path.resolve()
+
+
+@intrinsic
+def _call_read(_: Any, function: Any, device: Any, reading: Any) -> Any:
+    """Call ``int read(device, reading)`` at the address `function`."""
+    return types.int32(types.intp, types.intp, types.intp), _caller(("word", "word"))
+
+
+@intrinsic
+def _call_write(_: Any, function: Any, device: Any, voltage: Any) -> Any:
+    """Call ``int write(device, voltage)`` at the address `function`."""
+    return types.int32(types.intp, types.intp, types.float64), _caller(("word", "double"))
+
+
+def _caller(arguments: tuple[str, ...]) -> Any:
+    """Return code that calls the C function whose address comes first, with such arguments."""
+
+    def generate(_: Any, builder: Any, __: Any, values: Any) -> Any:
+        kinds = {"word": ir.IntType(64), "double": ir.DoubleType()}
+        signature = ir.FunctionType(ir.IntType(32), [kinds[name] for name in arguments])
+        address = builder.inttoptr(values[0], signature.as_pointer())
+        return builder.call(address, values[1:])
+
+    return generate
+
+
+def read_card(card: Card, _: int) -> int:
+    """Take a sample into ``card.reading``; return FRESH, NONE_IN_TIME or FAILED."""
+    return _call_read(card.read, card.device, card.reading.ctypes.data)
+
+
+def write_card(card: Card, voltage: float, _: int) -> int:
+    """Put out `voltage` (in the card's unit); return FRESH or FAILED."""
+    return _call_write(card.write, card.device, voltage)

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drivers of cards, each a shared library (:mod:`piezo_control.servo.driver`)."""

@@ -1,0 +1,57 @@
+/* SPDX-License-Identifier: Apache-2.0
+ *
+ * A driver of the servo: a shared library with these functions, C calling convention.
+ *
+ * piezo_open and piezo_close are called outside the loop and may take their time. piezo_read and piezo_write
+ * are called once each per sample from one real-time thread: no allocation, no lock, no wait beyond a part of
+ * `sample_time`. After piezo_close, as after the end of the process, the hardware itself must bring the
+ * voltage to rest: a driver cannot.
+ */
+#ifndef PIEZO_DRIVER_H
+#define PIEZO_DRIVER_H
+
+#include <stddef.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define PIEZO_DRIVER_ABI 1
+
+enum piezo_status {
+  PIEZO_FRESH = 0,        /* done; for piezo_read: a sample that was not returned before */
+  PIEZO_NONE_IN_TIME = 1, /* no new sample within the time limit; the servo holds, and gives up later */
+  PIEZO_FAILED = 2        /* the device is gone; piezo_error says why */
+};
+
+struct piezo_reading {
+  double deflection; /* as the card measures it, in V, counts or m: `sensor_scale` of the servo makes m of it */
+  double age;        /* s since it was taken, 0 if in this call */
+};
+
+typedef struct piezo_device piezo_device;
+
+/* Returns PIEZO_DRIVER_ABI. */
+int piezo_driver_abi(void);
+
+/* Opens the device that `options` describes, for a loop of period `sample_time` (s). Returns NULL, and why in
+ * `error` (at most `size` bytes with the final 0), if it cannot. The output stays as it is. */
+piezo_device *piezo_open(const char *options, double sample_time, char *error, size_t size);
+
+/* Takes a sample. */
+int piezo_read(piezo_device *device, struct piezo_reading *reading);
+
+/* Puts out a voltage, in the card's unit: `amplifier_gain` of the servo is V at the finger per unit. */
+int piezo_write(piezo_device *device, double voltage);
+
+/* Says what went wrong last; valid until the next call. */
+const char *piezo_error(piezo_device *device);
+
+/* Lets go of the device. */
+void piezo_close(piezo_device *device);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The servo: the laws of a finger between a sensor and an amplifier, in a thread of its own, in real time.
+
+The compiled loop shares arrays with the rest of the process and nothing else: it reads references and orders,
+and writes what it measured into a ring. It never waits for anybody.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import FunctionType
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from piezo_control.compiled import compiled
+from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.parameters import ParameterError
+from piezo_control.profile import Profile
+from piezo_control.safety import FAULT, NORMAL
+from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
+from piezo_control.servo.driver import FAILED, FRESH
+from piezo_control.servo.law import (
+    CAUSES,
+    DEVICE,
+    NO_CAUSE,
+    STOPPED,
+    Laws,
+    ServoParameters,
+    Settings,
+    Watch,
+    judge_time,
+    laws_of,
+    put_controller,
+    rearm,
+    servo_step,
+    settings_of,
+    trip,
+    watch_at_rest,
+)
+
+AHEAD = 1.0  # s: how far references are laid out in advance
+MARGIN = 5  # samples that a new reference leaves to the loop, which is about to read them
+KEPT = 5.0  # s of samples that wait for a reader
+
+
+class Driver(Protocol):
+    """A device that is open: what the loop calls, and what is called beside it."""
+
+    device: Any
+    """What `read` and `write` take; a named tuple whose array `reading` has the reading and its age (s)."""
+    read: Callable[[Any, int], int]
+    write: Callable[[Any, float, int], int]
+    """Both take the time of the present edge (ns), too, and return what a C driver returns."""
+
+    def error(self) -> str:
+        """Return what went wrong last."""
+
+    def close(self) -> None:
+        """Let go of the device."""
+
+
+class Orders(NamedTuple):
+    """What the loop is asked for; arrays of one integer."""
+
+    stop: np.ndarray
+    reset: np.ndarray  # counts the resets asked for
+    controller: np.ndarray  # which one to use
+
+
+class References(NamedTuple):
+    """A ring of references (m) by sample number; `until` is the first number not laid out."""
+
+    values: np.ndarray
+    until: np.ndarray
+
+
+class Log(NamedTuple):
+    """A ring of what was measured and done; `count` rows were written since the start."""
+
+    count: np.ndarray
+    number: np.ndarray
+    instant: np.ndarray  # ns of the monotonic clock
+    reference: np.ndarray
+    deflection: np.ndarray
+    command: np.ndarray
+    voltage: np.ndarray
+
+
+class Loop(NamedTuple):
+    """Everything that the compiled loop works on."""
+
+    settings: Settings
+    laws: Laws
+    watch: Watch
+    clock: Clock
+    orders: Orders
+    references: References
+    log: Log
+    amplifier_gain: float
+    at_next_edge: bool
+
+
+def run(loop: Loop, device: Any) -> None:
+    """Run the loop on a device until it is asked to stop and the voltage is at rest.
+
+    `read` and `write` are those of the device's driver, see :func:`loop_with`.
+    """
+    clock = loop.clock
+    period = clock.period
+    resets = loop.orders.reset[0]
+    voltage = loop.laws.feedforward_state.hysteresis.voltage[0]
+    begin(clock)
+    put_out = clock.edge[0]
+    while loop.orders.stop[0] == 0 or loop.watch.phase[0] != FAULT:
+        missed = clock.missed[0]
+        late = wait_for_edge(clock)
+        if loop.orders.reset[0] != resets:
+            resets = loop.orders.reset[0]
+            rearm(loop.watch)
+        if loop.orders.stop[0] != 0:
+            trip(loop.watch, STOPPED, 0.0)
+        judge_time(loop.settings, loop.watch, late * 1e-9, float(clock.missed[0] - missed))
+        written = FRESH
+        if loop.at_next_edge:
+            written = write(device, voltage / loop.amplifier_gain, clock.edge[0])
+            # The next voltage goes out no sooner than at the next edge.
+            share = min(1.0, (period - late) / period)
+        status = read(device, clock.edge[0])
+        if not loop.at_next_edge:
+            share = min(1.0, (now(clock) - put_out) / period)
+        if written == FAILED:
+            status = FAILED
+        voltage = sample(loop, status, device.reading, share)
+        if not loop.at_next_edge:
+            put_out = now(clock)
+            if write(device, voltage / loop.amplifier_gain, clock.edge[0]) == FAILED:
+                trip(loop.watch, DEVICE, 0.0)
+
+
+def sample(loop: Loop, status: int, reading: np.ndarray, share: float) -> float:
+    """Return the voltage (V) that answers a reading, and take everything down."""
+    number = loop.clock.number[0]
+    references, log = loop.references, loop.log
+    newest = min(number, references.until[0] - 1)
+    reference = references.values[newest % len(references.values)]
+    voltage = servo_step(
+        loop.settings,
+        loop.laws,
+        loop.watch,
+        loop.orders.controller[0],
+        status,
+        reading[0],
+        reading[1],
+        reference,
+        share,
+    )
+    row = log.count[0] % len(log.number)
+    log.number[row] = number
+    log.instant[row] = loop.clock.edge[0]
+    log.reference[row] = reference
+    log.deflection[row] = math.nan
+    if status == FRESH:
+        c = loop.settings
+        log.deflection[row] = c.sensor_scale * (reading[0] - c.sensor_zero)
+    log.command[row] = loop.watch.command[0]
+    log.voltage[row] = voltage
+    log.count[0] += 1
+    return voltage
+
+
+def loop_with(driver: Driver) -> Callable[[Loop, Any], None]:
+    """Return :func:`run` with the names `read` and `write` bound to those of a driver, compiled."""
+    names = {**run.__globals__, "read": driver.read, "write": driver.write}
+    return compiled(FunctionType(run.__code__, names, run.__name__))
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Consecutive samples of the loop; `instant` (s of the monotonic clock), m and V.
+
+    A deflection that did not come in time is NaN; a number that is left out was missed.
+    """
+
+    number: np.ndarray
+    instant: np.ndarray
+    reference: np.ndarray
+    deflection: np.ndarray
+    command: np.ndarray
+    voltage: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+
+class Servo:
+    """A finger's loop on a device, from the outside; nothing of it waits for the loop but `stop`.
+
+    Parameters
+    ----------
+    driver : Driver
+        An open device; closed by `stop`.
+    parameters, feedback, feedforward
+        The loop runs at the sample time of the controller `feedback`.
+    priority, cpu, spin
+        Of the loop's thread: of SCHED_FIFO (0: ordinary), the CPU to stay on (-1: any), and how long
+        before an edge it stops sleeping (s).
+
+    Raises ParameterError for a controller that does not fit.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        parameters: ServoParameters,
+        feedback: FeedbackParameters,
+        feedforward: FeedforwardParameters,
+        priority: int = 0,
+        cpu: int = -1,
+        spin: float = 5e-5,
+    ) -> None:
+        self.driver = driver
+        self.parameters = parameters
+        self.feedback = feedback
+        self.sample_time = h = feedback.sample_time
+        self._thread_options = (priority, cpu)
+        self.complaint = ""
+        ahead, kept = (1 << math.ceil(math.log2(max(span / h, 64))) for span in (2 * AHEAD, KEPT))
+        self._loop = Loop(
+            settings=settings_of(parameters, feedforward, h),
+            laws=laws_of(feedback, Feedforward(feedforward, h)),
+            watch=watch_at_rest(),
+            clock=clock_of(h, min(spin, 0.8 * h)),
+            orders=Orders(*(np.zeros(1, dtype=np.int64) for _ in Orders._fields)),
+            references=References(np.full(ahead, 0.0), np.zeros(1, dtype=np.int64)),
+            log=Log(
+                np.zeros(1, dtype=np.int64),
+                *(np.full(kept, 0, dtype=np.int64) for _ in range(2)),
+                *(np.full(kept, 0.0) for _ in range(4)),
+            ),
+            amplifier_gain=parameters.amplifier_gain,
+            at_next_edge=parameters.write == "next_edge",
+        )
+        self._run = loop_with(driver)
+        self._taken = 0
+        self.lost = 0
+        self._thread = threading.Thread(target=self._work, name="servo")
+        self.refer(Profile([0.0], [0.0]))
+
+    def start(self) -> None:
+        """Compile the loop, if that was not done before, and start it."""
+        self._loop.orders.stop[0] = 1
+        self._loop.watch.phase[0] = FAULT
+        self._run(self._loop, self.driver.device)  # returns at once: told to stop, and at rest
+        self._loop.orders.stop[0] = 0
+        self._loop.watch.phase[0] = NORMAL
+        self._thread.start()
+
+    def _work(self) -> None:
+        self.complaint = become_real_time(*self._thread_options)
+        self._run(self._loop, self.driver.device)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the loop runs; until it is stopped it does, at rest after a fault."""
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Bring the voltage to rest, end the loop and close the device."""
+        self._loop.orders.stop[0] = 1
+        if self._thread.ident is not None:
+            self._thread.join()
+        self.driver.close()
+
+    def reset(self) -> None:
+        """Leave a latched fault; the controller takes over from rest."""
+        self._loop.orders.reset[0] += 1
+
+    def change_controller(self, feedback: FeedbackParameters) -> None:
+        """Let another controller take over between two samples, with the command where it is.
+
+        Raises ParameterError when it was made for another sample time, or cannot be taken.
+        """
+        if feedback.sample_time != self.sample_time:
+            raise ParameterError(
+                f"controller '{feedback.name}' was made for {feedback.sample_time:g} s, the loop runs at "
+                f"{self.sample_time:g} s"
+            )
+        orders, watch = self._loop.orders, self._loop.watch
+        other = 1 - int(orders.controller[0])
+        if self.is_running and watch.in_use[0] == other:
+            raise ParameterError("the last change of the controller is not through yet: try again")
+        put_controller(self._loop.laws.controllers[other], feedback)
+        self.feedback = feedback
+        orders.controller[0] = other
+
+    @property
+    def number(self) -> int:
+        """Number of the last sample, -1 before the first."""
+        return int(self._loop.clock.number[0])
+
+    def refer(self, profile: Profile) -> None:
+        """Follow a reference (m over s since sample 0) from a few samples ahead of the present one on."""
+        self._profile = profile
+        self._lay_out(self.number + MARGIN if self.is_running else 0)
+
+    def look_ahead(self) -> None:
+        """Lay out the references of the next second; to be called several times in each."""
+        self._lay_out(int(self._loop.references.until[0]))
+
+    def _lay_out(self, first: int) -> None:
+        ring = self._loop.references
+        last = self.number + round(AHEAD / self.sample_time)
+        if last <= first:
+            return
+        numbers = np.arange(max(first, last - len(ring.values) // 2), last)
+        ring.values[numbers % len(ring.values)] = self._profile.at(numbers * self.sample_time)
+        ring.until[0] = last
+
+    def samples(self) -> Samples:
+        """Return what the loop has written since this was asked last; what was not kept is counted as lost."""
+        log = self._loop.log
+        count = int(log.count[0])
+        kept = len(log.number) - 64  # rows that are written meanwhile are not among the newest
+        first = max(self._taken, count - kept)
+        self.lost += first - self._taken
+        rows = np.arange(first, count) % len(log.number)
+        self._taken = count
+        number, instant, *signals = (ring[rows] for ring in log[1:])
+        return Samples(number, instant * 1e-9, *signals)
+
+    @property
+    def phase(self) -> int:
+        """NORMAL, HOLDING, RAMPING or FAULT of :mod:`piezo_control.safety`."""
+        return int(self._loop.watch.phase[0])
+
+    @property
+    def cause(self) -> str:
+        """What latched the fault, in words; empty if nothing did."""
+        watch = self._loop.watch
+        code = int(watch.cause[0])
+        if code == NO_CAUSE:
+            return ""
+        text = CAUSES[code](float(watch.cause_value[0]), self.parameters)
+        said = self.driver.error() if code == DEVICE else ""
+        return f"{text}: {said}" if said else text
+
+    @property
+    def voltage(self) -> float:
+        """The last voltage (V)."""
+        return float(self._loop.laws.feedforward_state.hysteresis.voltage[0])
+
+    @property
+    def clipped(self) -> int:
+        """Number of samples at which the voltage or slew limit acted."""
+        return int(self._loop.laws.feedforward_state.clipped[0])
+
+    @property
+    def faults(self) -> int:
+        """Number of times that something was wrong since the last reset."""
+        return int(self._loop.watch.times[0])
+
+    @property
+    def missed(self) -> int:
+        """Number of periods that were missed."""
+        return int(self._loop.clock.missed[0])
+
+    @property
+    def lateness(self) -> np.ndarray:
+        """How often a period began so many microseconds late (:mod:`piezo_control.servo.clock`)."""
+        return self._loop.clock.lateness.copy()
