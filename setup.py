@@ -2,7 +2,7 @@
 from glob import glob
 from os.path import dirname, join
 
-from setuptools import find_packages, setup
+from setuptools import Extension, find_packages, setup
 
 NAME = "piezo_gripper"
 PARAMS = [path for path in glob("params/**", recursive=True) if path.endswith((".yaml", ".xml"))]
@@ -22,7 +22,10 @@ setup(
     maintainer_email="piezo_gripper@example.com",
     license="Apache-2.0",
     packages=find_packages(include=["piezo_control*", "piezo_sim*"]),
-    package_data={"": ["*.html", "*.j2", "*.css"]},
+    package_data={"": ["*.html", "*.j2", "*.css", "*.h"]},
+    ext_modules=[  # plain shared libraries, drivers of the servo
+        Extension("piezo_control.servo.drivers.udp", ["piezo_control/servo/drivers/udp.c"]),
+    ],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py"), *glob("msg_defs/msg/*.msg")]),
@@ -59,8 +62,11 @@ setup(
             "experiment = piezo_sim.start:experiment",
             "identify = piezo_control.start:identify",
             "synthesize = piezo_control.start:synthesize",
+            "servo = piezo_control.start:servo",
+            "udp_finger = piezo_sim.start:udp_finger",
             "gripper = piezo_control.start:gripper",
             "monte_carlo = piezo_sim.start:monte_carlo",
         ],
+        "piezo_gripper.drivers": ["simulated = piezo_sim.driver:Simulation"],
     },
 )

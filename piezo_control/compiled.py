@@ -14,6 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 
 @functools.cache
 def has_numba() -> bool:
@@ -51,6 +53,13 @@ def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
         return numba.njit(cache=True, **options)(loop)
     finally:
         numba.config.CACHE_DIR = before
+
+
+def as_arrays(tree: Any) -> Any:
+    """Return nested named tuples with every list turned into a float64 array, for a compiled loop."""
+    if isinstance(tree, tuple):
+        return type(tree)(*map(as_arrays, tree))
+    return np.array(tree, dtype=float) if isinstance(tree, list) else tree
 
 
 def _collect(function: Any, kernels: list[Callable[..., Any]]) -> None:

@@ -45,6 +45,13 @@ class FeedbackParameters:
     sample_time: float = parameter(
         1e-4, "sample time the coefficients were designed for", unit="s", low=1e-6, high=1.0
     )
+    delay_samples: int = parameter(
+        1, "delay from the voltage to the reading that the coefficients were designed for", low=0,
+        high=1000,
+    )  # fmt: skip
+    denominator: tuple[float, ...] = parameter(
+        (), "denominator of the D(s) that they were designed for; none: not said"
+    )
     command_low: float = parameter(
         -22e-6, "lowest command; the end of the inverse's reachable range", unit="m"
     )

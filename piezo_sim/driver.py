@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from piezo_control.compiled import as_arrays
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.thermal import REFERENCE_DEGC
-from piezo_sim.engine import as_arrays
 from piezo_sim.plant import cantilever
 from piezo_sim.plant.cantilever import (
     CantileverModel,

@@ -19,8 +19,8 @@ import numpy as np
 
 from piezo_control import feedback as feedback_law
 from piezo_control import feedforward as feedforward_law
+from piezo_control.compiled import as_arrays, has_numba
 from piezo_control.compiled import compiled as compile_loop
-from piezo_control.compiled import has_numba
 from piezo_control.feedback import (
     FeedbackCoefficients,
     FeedbackParameters,
@@ -334,13 +334,6 @@ def finger_at_rest(
             cantilever.rest(sampled, plant.sensor.delay_samples, temperature_degc),
         )
     )
-
-
-def as_arrays(tree: Any) -> Any:
-    """Return nested named tuples with every list turned into a float64 array."""
-    if isinstance(tree, tuple):
-        return type(tree)(*map(as_arrays, tree))
-    return np.array(tree, dtype=float) if isinstance(tree, list) else tree
 
 
 def _leaves(tree: Any) -> Iterator[np.ndarray]:

@@ -15,9 +15,10 @@ LEVELS = [
     {"parameters", "profile", "metrics", "safety", "sequence", "shared", "compiled", "start"},
     {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
     {"shaping", "feedforward", "sensorless", "design"},
-    {"identification", "nodes"},
+    {"identification", "servo"},
+    {"nodes"},
     {"plant", "temperature"},
-    {"engine", "sim_nodes"},
+    {"engine", "sim_nodes", "driver", "udp_finger"},
     {"experiment"},
 ]
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}

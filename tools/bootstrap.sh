@@ -129,6 +129,7 @@ pins=$(cat requirements/*.txt | fingerprint)
 sources=$({
   echo "$place $pins"
   cat package.xml setup.py setup.cfg tools/*.bash tools/*.cmake
+  cat piezo_control/servo/drivers/*.[ch]
   find params launch piezo_control piezo_sim '(' -name __init__.py -o -path 'params/*' -o -path 'launch/*' ')' -type f |
     grep -v __pycache__ | LC_ALL=C sort
   find msg_defs -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum

@@ -365,6 +365,8 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
     return FeedbackParameters(
         controller="state_space",
         name=problem.name,
+        delay_samples=problem.finger.delay_samples,
+        denominator=problem.finger.denominator,
         sample_time=problem.finger.sample_time,
         command_low=problem.finger.command_low,
         command_high=problem.finger.command_high,

@@ -9,6 +9,7 @@ from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.parameters import parameter
 from piezo_control.safety import SafetyParameters
+from piezo_control.servo.parameters import ServoParameters
 
 MODES = ("lockstep", "free_running")
 
@@ -56,9 +57,52 @@ class FeedbackNodeParameters(FeedbackParameters, LoopParameters):
     )
 
 
+@dataclass(frozen=True)
+class ServoNodeParameters(ServoParameters):
+    """The loop's parameters and those of its surroundings."""
+
+    driver: str = parameter(
+        "simulated", "'simulated', 'udp', or the path of a shared library (piezo_driver.h)"
+    )
+    driver_options: str = parameter(
+        "", "of the driver; simulated: parameter file of a cantilever, udp: HOST:PORT"
+    )
+    controller_file: str = parameter(
+        "robust",
+        "parameter file of the controller, or the name of a shipped one; also while running",
+    )
+    feedforward_file: str = parameter(
+        "", "parameter file of the inverse hysteresis and the limits; empty: the paper's finger"
+    )
+    voltage_share: float = parameter(
+        1.0, "share of the voltage limits that is used, for a first power-on", low=1e-3, high=1.0
+    )
+    priority: int = parameter(
+        80, "of the loop under the real-time scheduler; 0: ordinary scheduler", low=0, high=99
+    )
+    cpu: int = parameter(-1, "CPU that the loop stays on; -1: any", low=-1, high=1023)
+    spin: float = parameter(
+        5e-5,
+        "how long before its time the loop stops sleeping and spins",
+        unit="s",
+        low=0.0,
+        high=1e-2,
+    )
+    block_period: float = parameter(
+        1e-2, "how often `samples` are published", unit="s", low=1e-3, high=1.0
+    )
+    sample_period: float = parameter(
+        1e-2, "how often a single deflection, command and voltage is published, for people", unit="s",
+        low=1e-3, high=10.0,
+    )  # fmt: skip
+    tolerance: float = parameter(
+        0.5e-6, "on target: the error stays so small", unit="m", low=0.0, high=1e-3
+    )
+
+
 RECORDED = (
-    "reference", "reference_profile", "deflection", "command", "voltage", "temperature", "tip_force",
-    "tip_force_profile", "state",
+    "reference", "reference_profile", "deflection", "command", "voltage", "samples", "temperature",
+    "tip_force", "tip_force_profile", "state",
 )  # fmt: skip
 """Topics of a finger."""
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from rclpy.node import Node
 
@@ -22,9 +24,20 @@ def to_message(profile: Profile) -> ProfileMessage:
 
 
 class ProfileInput:
-    """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k."""
+    """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k.
 
-    def __init__(self, node: Node, topic: str, sample_time: float, largest: float) -> None:
+    `on_change()` is called with every new one.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        topic: str,
+        sample_time: float,
+        largest: float,
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._on_change = on_change
         self._node = node
         self._topic = topic
         self._largest = largest
@@ -34,6 +47,11 @@ class ProfileInput:
 
     def __getitem__(self, number: int) -> float:
         return self._sampled[number]
+
+    @property
+    def profile(self) -> Profile:
+        """The signal over time."""
+        return self._sampled.profile
 
     def restart(self, sample_time: float) -> None:
         """Read the same signal at another sample time."""
@@ -58,3 +76,4 @@ class ProfileInput:
             self._node.get_logger().error(f"'{topic}' ignored: {error}")
             return
         self._sampled = SampledProfile(profile, self._sampled.sample_time)
+        self._on_change()

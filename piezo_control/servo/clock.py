@@ -46,14 +46,9 @@ class Clock(NamedTuple):
 
 def clock_of(period: float, spin: float) -> Clock:
     """Return a clock of this period and spin time (s) that has not begun."""
-    ones = [np.zeros(1, dtype=np.int64) for _ in range(3)]
-    return Clock(
-        round(period * 1e9),
-        round(spin * 1e9),
-        *ones,
-        np.zeros(LATENESS_BINS, dtype=np.int64),
-        np.zeros(2, dtype=np.int64),
-    )
+    sizes = {"edge": 1, "number": 1, "missed": 1, "lateness": LATENESS_BINS, "timespec": 2}
+    arrays = {name: np.zeros(size, dtype=np.int64) for name, size in sizes.items()}
+    return Clock(round(period * 1e9), round(spin * 1e9), **arrays)
 
 
 def now(clock: Clock) -> int:

@@ -24,13 +24,14 @@ from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, NORMAL
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
 from piezo_control.servo.driver import FAILED, FRESH
+from piezo_control.servo.driver import read_card as read
+from piezo_control.servo.driver import write_card as write
 from piezo_control.servo.law import (
     CAUSES,
     DEVICE,
     NO_CAUSE,
     STOPPED,
     Laws,
-    ServoParameters,
     Settings,
     Watch,
     judge_time,
@@ -42,6 +43,7 @@ from piezo_control.servo.law import (
     trip,
     watch_at_rest,
 )
+from piezo_control.servo.parameters import ServoParameters
 
 AHEAD = 1.0  # s: how far references are laid out in advance
 MARGIN = 5  # samples that a new reference leaves to the loop, which is about to read them
@@ -53,9 +55,10 @@ class Driver(Protocol):
 
     device: Any
     """What `read` and `write` take; a named tuple whose array `reading` has the reading and its age (s)."""
-    read: Callable[[Any, int], int]
-    write: Callable[[Any, float, int], int]
-    """Both take the time of the present edge (ns), too, and return what a C driver returns."""
+    read: Callable[..., int]
+    write: Callable[..., int]
+    """``read(device, edge)`` and ``write(device, voltage, edge)``, `edge` being the time of the present edge
+    (ns); both return what a C driver returns. They are compiled with the loop."""
 
     def error(self) -> str:
         """Return what went wrong last."""
@@ -108,7 +111,7 @@ class Loop(NamedTuple):
 def run(loop: Loop, device: Any) -> None:
     """Run the loop on a device until it is asked to stop and the voltage is at rest.
 
-    `read` and `write` are those of the device's driver, see :func:`loop_with`.
+    `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
     """
     clock = loop.clock
     period = clock.period

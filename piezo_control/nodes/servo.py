@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop in real time: K and H_s⁻¹ between a deflection sensor and a voltage amplifier.
+
+in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0)
+out: samples (SampleBlock: every sample), deflection (Sample, m), command (Sample, m), voltage (Sample, V): one
+     in a hundred or so, state (FingerState)
+
+One compiled loop in a thread under the real-time scheduler, at the sample time of its controller; ROS
+runs beside it and can be late without the finger noticing. What the certificate of the controller does not
+cover ends with the voltage at rest and a fault that stays until `~/reset`: a silent, old, frozen or saturated
+sensor, a deflection that the model cannot explain, an oscillation, late or missed periods, a lost device.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from importlib.metadata import entry_points
+from typing import Any
+
+import numpy as np
+
+from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.nodes import base
+from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.feedback import read_controller
+from piezo_control.nodes.parameters import ServoNodeParameters
+from piezo_control.nodes.profile_input import ProfileInput
+from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.parameters import ParameterError, build, load
+from piezo_control.safety import FAULT, HOLDING, LARGEST_DEFLECTION, NORMAL, RAMPING
+from piezo_control.servo.clock import lateness_quantile
+from piezo_control.servo.driver import DriverError, SharedLibrary
+from piezo_control.servo.loop import Driver, Samples, Servo
+from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
+
+STATE_PERIOD = 0.1  # s
+PHASES = {
+    NORMAL: FingerState.RUNNING,
+    HOLDING: FingerState.HOLDING,
+    RAMPING: FingerState.RAMPING,
+    FAULT: FingerState.FAULT,
+}
+LATCHED_PHASES = (FingerState.RAMPING, FingerState.FAULT)
+
+
+def open_driver(parameters: ServoNodeParameters, sample_time: float) -> Driver:
+    """Return the device of `parameters`, open.
+
+    A driver is a shared library, or what a package names in its entry points `piezo_gripper.drivers`.
+
+    Raises ParameterError for a driver that does not exist, DriverError when the device does not open.
+    """
+    for entry in entry_points(group="piezo_gripper.drivers", name=parameters.driver):
+        return entry.load()(parameters.driver_options, sample_time)
+    return SharedLibrary(parameters.driver, parameters.driver_options, sample_time)
+
+
+def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
+    """Return inverse and limits of a parameter file, the limits scaled by the share that is to be used."""
+    path = parameters.feedforward_file
+    whole = build(FeedforwardParameters, load(path, "feedforward") if path else {}, path)
+    share = parameters.voltage_share
+    return replace(
+        whole, voltage_low=share * whole.voltage_low, voltage_high=share * whole.voltage_high
+    )
+
+
+class ServoNode(FingerNode):
+    NAME = "servo"
+    PARAMETERS = ServoNodeParameters
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.servo: Servo | None = None
+        self.blocks = self.create_publisher(SampleBlock, "samples", SAMPLE)
+        self.singles = {
+            name: self.create_publisher(Sample, name, SAMPLE)
+            for name in ("deflection", "command", "voltage")
+        }
+        self.states = self.create_publisher(FingerState, "state", LATCHED)
+        self.reference = ProfileInput(self, "reference", 1.0, LARGEST_DEFLECTION, self._refer)
+        self.drain = self.create_steady_timer(
+            self.parameters.block_period, self._drain, autostart=False
+        )
+        self.create_steady_timer(STATE_PERIOD, self._publish_state)
+        self.phase = FingerState.IDLE
+        self._last: Samples | None = None
+        self._told = 0.0
+        self._errors: list[tuple[float, float]] = []
+
+    def refuses_while_active(self, names: set[str]) -> set[str]:
+        return names - {"controller_file", "tolerance", "sample_period"}
+
+    def check(self, parameters: ServoNodeParameters) -> None:
+        if parameters.controller_file != self.parameters.controller_file or not self.active:
+            controller = read_controller(parameters.controller_file)
+            self._check_delay(controller.delay_samples, parameters)
+            if self.servo and controller.sample_time != self.servo.sample_time:
+                raise ParameterError(
+                    f"'controller_file' is '{parameters.controller_file}', made for "
+                    f"{controller.sample_time:g} s, the loop runs at {self.servo.sample_time:g} s: deactivate "
+                    f"'{self.NAME}' first"
+                )
+
+    def _check_delay(self, designed: int, p: ServoNodeParameters) -> None:
+        delay = p.delay_samples + (p.write == "next_edge")
+        if designed != delay:
+            raise ParameterError(
+                f"controller '{p.controller_file}' was designed for a delay of {designed} samples, this loop "
+                f"has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"
+            )
+
+    def start(self) -> None:
+        p = self.parameters
+        controller = read_controller(p.controller_file)
+        if controller.controller != "none":
+            self._check_delay(controller.delay_samples, p)
+            if not controller.certified:
+                self.get_logger().warning(
+                    f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "
+                    "that the loop is stable with this finger"
+                )
+        feedforward = read_feedforward(p)
+        try:
+            driver = open_driver(p, controller.sample_time)
+        except DriverError as error:
+            raise ValueError(str(error)) from None
+        self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin)
+        self.servo.refer(self.reference.profile)
+        self._told = self._since = time.monotonic()
+        self._rates = [(self._told, 0)]
+        self._errors.clear()
+        self.servo.start()
+        # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
+        self._to_wall = time.time() - time.monotonic()
+        self.drain.timer_period_ns = round(p.block_period * 1e9)
+        self.drain.reset()
+        self.get_logger().info(
+            f"loop at {1.0 / controller.sample_time:g} Hz on driver '{p.driver}' with controller "
+            f"'{controller.name}'"
+        )
+        self._follow_phase()
+
+    def stop(self) -> None:
+        self.drain.cancel()
+        if self.servo:
+            self.servo.stop()
+            self._drain()
+            self.servo = None
+        self.phase = FingerState.IDLE
+        self._publish_state()
+
+    def apply(self) -> None:
+        """Let the controller of a changed `controller_file` take over."""
+        if self.servo:
+            controller = read_controller(self.parameters.controller_file)
+            if controller != self.servo.feedback:
+                self.servo.change_controller(controller)
+                self.get_logger().info(f"controller '{controller.name}' takes over")
+
+    def reset(self) -> None:
+        if self.servo:
+            self.servo.reset()
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        s = self.servo
+        if s is None:
+            return "", {}
+        lateness = s.lateness
+        figures: dict[str, Any] = {
+            "controller": s.feedback.name,
+            "certified": s.feedback.certified,
+            "sample": s.number,
+            "rate (Hz)": f"{self._rate():.1f}",
+            "missed periods": s.missed,
+            "samples not published": s.lost,
+            "clipped": s.clipped,
+            "faults": s.faults,
+        }
+        for share in (0.5, 0.9, 0.99, 0.999):
+            figures[f"late, {share:.1%} (us)"] = f"{lateness_quantile(lateness, share) * 1e6:.0f}"
+        return s.cause or s.complaint, figures
+
+    def _refer(self) -> None:
+        if self.servo:
+            self.servo.refer(self.reference.profile)
+
+    def _rate(self) -> float:
+        """Return how many samples a second were served lately."""
+        (begin, served), (end, now_served) = self._rates[0], self._rates[-1]
+        return (now_served - served) / (end - begin) if end > begin else 0.0
+
+    def _drain(self) -> None:
+        """Publish what the loop has written, and lay out its references."""
+        s = self.servo
+        assert s is not None
+        s.look_ahead()
+        samples = s.samples()
+        self._follow_phase()
+        if not len(samples):
+            return
+        self._last = samples
+        ends = np.flatnonzero(np.diff(samples.number) != 1) + 1
+        for part in np.split(np.arange(len(samples)), ends):
+            self.blocks.publish(self._block(samples, part))
+        error = np.nan_to_num(np.abs(samples.reference - samples.deflection), nan=np.inf)
+        self._errors.append((samples.instant[-1], float(error.max())))
+        while self._errors[0][0] < samples.instant[-1] - STATE_PERIOD:
+            self._errors.pop(0)
+        if samples.instant[-1] - self._told >= self.parameters.sample_period:
+            self._told = samples.instant[-1]
+            for name, publisher in self.singles.items():
+                message = Sample(number=int(samples.number[-1]), period=s.sample_time)
+                message.header.stamp = self._stamp(samples.instant[-1])
+                message.value = float(getattr(samples, name)[-1])
+                publisher.publish(message)
+
+    def _block(self, samples: Samples, rows: np.ndarray) -> SampleBlock:
+        assert self.servo is not None
+        block = SampleBlock(number=int(samples.number[rows[0]]), period=self.servo.sample_time)
+        block.header.stamp = self._stamp(samples.instant[rows[0]])
+        for name in ("reference", "deflection", "command", "voltage"):
+            setattr(block, name, getattr(samples, name)[rows])
+        return block
+
+    def _stamp(self, instant: float) -> Any:
+        nanoseconds = round((instant + self._to_wall) * 1e9)
+        stamp = base.system_time()
+        stamp.sec, stamp.nanosec = divmod(nanoseconds, 10**9)
+        return stamp
+
+    def _follow_phase(self) -> None:
+        """Say in `state` and the log what the loop's guard does."""
+        s = self.servo
+        assert s is not None
+        phase = PHASES[s.phase]
+        if phase == self.phase:
+            return
+        before, self.phase = self.phase, phase
+        if phase in LATCHED_PHASES and before not in LATCHED_PHASES:
+            self.get_logger().error(
+                f"{s.cause}; voltage goes to rest and stays there until '~/reset'"
+            )
+            self.publish_diagnostics()
+        self._publish_state()
+
+    def _publish_state(self) -> None:
+        state = FingerState(phase=self.phase)
+        state.header.stamp = base.system_time()
+        if s := self.servo:
+            self._rates.append((time.monotonic(), s.number + 1 - s.missed))
+            self._rates = self._rates[-11:]
+            state.samples = max(0, s.number + 1)
+            state.voltage = s.voltage
+            state.clipped = s.clipped
+            state.overruns = s.missed
+            state.rate = self._rate()
+            state.jitter = lateness_quantile(s.lateness, 0.999)
+            state.text = s.cause or s.complaint
+            if self._last:
+                state.deflection = float(self._last.deflection[-1])
+            worst = max((error for _, error in self._errors), default=np.inf)
+            state.on_target = bool(
+                self.phase == FingerState.RUNNING and worst <= self.parameters.tolerance
+            )
+        self.states.publish(state)
+
+
+def main() -> int:
+    return base.run(ServoNode)

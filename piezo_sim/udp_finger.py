@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A finger at the other end of the servo's `udp` driver: a simulated piezocantilever in real time.
+
+Every datagram brings a voltage, which is held from then on, and is answered with the deflection measured just
+before. Without a voltage for the hold time the finger ramps itself to 0 V, as the hardware of a real one must.
+When it is stopped it says, and with --report writes, what voltages it saw.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import socket
+import struct
+import sys
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from piezo_control.compiled import compiled
+from piezo_control.parameters import ParameterError, build, load
+from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
+from piezo_control.servo.clock import Clock, become_real_time, clock_of, now
+from piezo_sim.driver import Device, device_of, read, write
+from piezo_sim.plant.cantilever import CantileverParameters
+
+PORT = 9750
+WORD = struct.unpack("<q", b"PZG1\0\0\0\0")[0]
+SIZE = 24  # bytes of a datagram: word, number, value
+
+_recvfrom: Any = types.ExternalFunction(
+    "recvfrom",
+    types.intp(types.int32, types.intp, types.intp, types.int32, types.intp, types.intp),
+)
+_sendto: Any = types.ExternalFunction(
+    "sendto", types.intp(types.int32, types.intp, types.intp, types.int32, types.intp, types.uint32)
+)
+
+
+class Line(NamedTuple):
+    """The socket, one datagram as integers and as floats in the same memory, and who sent it."""
+
+    socket: int
+    integers: np.ndarray
+    floats: np.ndarray
+    address: np.ndarray
+    length: np.ndarray
+
+
+class Seen(NamedTuple):
+    """What the finger saw; arrays of one number."""
+
+    samples: np.ndarray
+    lost: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+    step: np.ndarray  # largest change from one voltage to the next
+    number: np.ndarray
+    ramps: np.ndarray  # how often nothing came for the hold time
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a finger saw, V."""
+
+    samples: int
+    lost_datagrams: int
+    lowest_voltage: float
+    highest_voltage: float
+    largest_step: float
+    last_voltage: float
+    own_ramps: int
+
+
+def serve(
+    line: Line, device: Device, clock: Clock, seen: Seen, hold: int, step: float, stop: np.ndarray
+) -> None:
+    """Answer datagrams until `stop`; after `hold` ns without one go `step` (V) per ramp period to 0 V."""
+    heard = now(clock)
+    while stop[0] == 0:
+        line.length[0] = 128
+        size = _recvfrom(
+            line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
+            line.length.ctypes.data,
+        )  # fmt: skip
+        instant = now(clock)
+        if size == SIZE and line.integers[0] == WORD:
+            voltage = line.floats[2]
+            if seen.samples[0] > 0.0:
+                seen.lost[0] += max(line.integers[1] - seen.number[0] - 1, 0)
+                seen.step[0] = max(seen.step[0], abs(voltage - device.demand[0]))
+            heard = instant
+            seen.number[0] = line.integers[1]
+            seen.samples[0] += 1.0
+            seen.lowest[0] = min(seen.lowest[0], voltage)
+            seen.highest[0] = max(seen.highest[0], voltage)
+            read(device, instant)
+            write(device, voltage, instant)
+            line.floats[2] = device.reading[0]
+            _sendto(
+                line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
+                line.length[0],
+            )  # fmt: skip
+        elif instant - heard > hold and device.demand[0] != 0.0:
+            if seen.ramps[0] == 0.0 or heard != 0:
+                seen.ramps[0] += 1.0
+                heard = 0
+            write(device, toward(0.0, step, device.demand[0]), instant)
+
+
+class UdpFinger:
+    """The finger in a thread of its own, bound to a UDP port of an address.
+
+    Raises OSError when the port cannot be had.
+    """
+
+    def __init__(
+        self,
+        plant: CantileverParameters,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        safety: SafetyParameters | None = None,
+        priority: int = 0,
+    ) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((host, port))
+        timeout = struct.pack("ll", 0, round(RAMP_PERIOD * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
+        self.port = self._socket.getsockname()[1]
+        safety = safety or SafetyParameters()
+        datagram = np.zeros(3, dtype=np.int64)
+        self._line = Line(
+            self._socket.fileno(), datagram, datagram.view(float), np.zeros(16, dtype=np.int64),
+            np.zeros(1, dtype=np.uint32),
+        )  # fmt: skip
+        self._device = device_of(plant)
+        self._seen = Seen(*(np.zeros(1) for _ in Seen._fields))
+        self._stop = np.ones(1, dtype=np.int64)
+        self._arguments = (
+            self._line, self._device, clock_of(plant.sample_time, 0.0), self._seen,
+            round(safety.hold_time * 1e9), safety.ramp * RAMP_PERIOD, self._stop,
+        )  # fmt: skip
+        self._priority = priority
+        self._thread = threading.Thread(target=self._work, name="finger")
+
+    def start(self) -> None:
+        """Compile what answers, if that was not done before, and begin to answer."""
+        compiled(serve)(*self._arguments)
+        self._stop[0] = 0
+        self._thread.start()
+
+    def _work(self) -> None:
+        become_real_time(self._priority, -1)
+        compiled(serve)(*self._arguments)
+
+    def stop(self) -> Report:
+        """Answer no more; return what was seen."""
+        self._stop[0] = 1
+        self._thread.join()
+        self._socket.close()
+        seen = self._seen
+        return Report(
+            samples=int(seen.samples[0]),
+            lost_datagrams=int(seen.lost[0]),
+            lowest_voltage=float(seen.lowest[0]),
+            highest_voltage=float(seen.highest[0]),
+            largest_step=float(seen.step[0]),
+            last_voltage=float(self._device.demand[0]),
+            own_ramps=int(seen.ramps[0]),
+        )
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (%(default)s)")
+    parser.add_argument("--port", type=int, default=PORT, help="UDP port (%(default)s)")
+    parser.add_argument("--cantilever", metavar="FILE", help="parameter file of a cantilever")
+    parser.add_argument("--report", metavar="FILE", help="where to write what was seen, as JSON")
+    parser.add_argument(
+        "--priority",
+        type=int,
+        default=0,
+        help="of the real-time scheduler, 0: ordinary (%(default)s)",
+    )
+    arguments = parser.parse_args()
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: stopped.set())
+    try:
+        plant = CantileverParameters()
+        if arguments.cantilever:
+            values = load(arguments.cantilever, "cantilever")
+            plant = build(CantileverParameters, values, arguments.cantilever)
+        finger = UdpFinger(plant, arguments.host, arguments.port, priority=arguments.priority)
+    except (ParameterError, OSError, OverflowError) as error:
+        print(f"udp_finger: {error}", file=sys.stderr)
+        return 2
+    finger.start()
+    print(f"udp_finger: answers at {arguments.host}:{finger.port}", flush=True)
+    stopped.wait()
+    report = asdict(finger.stop())
+    print(json.dumps(report))
+    if arguments.report:
+        Path(arguments.report).write_text(json.dumps(report, indent=2) + "\n")
+    return 0
