@@ -32,6 +32,8 @@ class Device(NamedTuple):
     begun: np.ndarray  # ns of the monotonic clock
     samples: np.ndarray
     demand: np.ndarray  # V, held
+    written: np.ndarray  # V, and from when on it holds (ns)
+    written_at: np.ndarray
     temperature: np.ndarray  # °C
     tip_force: np.ndarray  # N
     reading: np.ndarray  # deflection (m), age (s)
@@ -49,6 +51,8 @@ def device_of(plant: CantileverParameters, temperature_degc: float = REFERENCE_D
             np.zeros(1, dtype=np.int64),
             np.zeros(1, dtype=np.int64),
             np.zeros(1),
+            np.zeros(1),
+            np.zeros(1, dtype=np.int64),
             np.full(1, temperature_degc),
             np.zeros(1),
             np.zeros(2),
@@ -56,12 +60,14 @@ def device_of(plant: CantileverParameters, temperature_degc: float = REFERENCE_D
     )
 
 
-def pass_time(device: Device, instant: int) -> None:
-    """Let the time pass until `instant` (ns), and read the sensor there."""
+def read(device: Device, instant: int) -> int:
+    """Let the time pass until `instant` (ns), and read the sensor there; a reading is always there."""
     if device.begun[0] == 0:
         # Half a period early: an edge that is a little late or early falls into the same sample.
         device.begun[0] = instant - device.period // 2
         look(device.plant, device.state, np.random.standard_normal(), np.random.random())
+    if device.written_at[0] < instant:
+        device.demand[0] = device.written[0]
     due = (instant - device.begun[0]) // device.period
     while device.samples[0] < due:
         advance(
@@ -73,19 +79,15 @@ def pass_time(device: Device, instant: int) -> None:
         )
         look(device.plant, device.state, np.random.standard_normal(), np.random.random())
         device.samples[0] += 1
+    device.demand[0] = device.written[0]
     device.reading[0] = device.state.readings[0]
-
-
-def read(device: Device, instant: int) -> int:
-    """Take the reading of `instant` (ns); always there."""
-    pass_time(device, instant)
     return 0
 
 
 def write(device: Device, voltage: float, instant: int) -> int:
     """Hold `voltage` (V) from `instant` (ns) on."""
-    pass_time(device, instant)
-    device.demand[0] = voltage
+    device.written[0] = voltage
+    device.written_at[0] = instant
     return 0
 
 

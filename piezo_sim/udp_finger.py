@@ -89,6 +89,7 @@ def serve(
             line.length.ctypes.data,
         )  # fmt: skip
         instant = now(clock)
+        read(device, instant)
         if size == SIZE and line.integers[0] == WORD:
             voltage = line.floats[2]
             if seen.samples[0] > 0.0:
@@ -99,18 +100,19 @@ def serve(
             seen.samples[0] += 1.0
             seen.lowest[0] = min(seen.lowest[0], voltage)
             seen.highest[0] = max(seen.highest[0], voltage)
-            read(device, instant)
-            write(device, voltage, instant)
             line.floats[2] = device.reading[0]
             _sendto(
                 line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
                 line.length[0],
             )  # fmt: skip
         elif instant - heard > hold and device.demand[0] != 0.0:
-            if seen.ramps[0] == 0.0 or heard != 0:
+            if heard > 0:
                 seen.ramps[0] += 1.0
-                heard = 0
-            write(device, toward(0.0, step, device.demand[0]), instant)
+                heard = 0  # counted
+            voltage = toward(0.0, step, device.demand[0])
+        else:
+            continue
+        write(device, voltage, instant)
 
 
 class UdpFinger:

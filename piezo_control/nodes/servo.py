@@ -146,7 +146,7 @@ class ServoNode(FingerNode):
         self.drain.cancel()
         if self.servo:
             self.servo.stop()
-            self._drain()
+            self._publish_samples()
             self.servo = None
         self.phase = FingerState.IDLE
         self._publish_state()
@@ -192,20 +192,27 @@ class ServoNode(FingerNode):
         return (now_served - served) / (end - begin) if end > begin else 0.0
 
     def _drain(self) -> None:
-        """Publish what the loop has written, and lay out its references."""
+        """Keep the loop supplied with references, and say what it does."""
+        if self.servo:
+            self.servo.look_ahead()
+            self._follow_phase()
+            self._publish_samples()
+
+    def _publish_samples(self) -> None:
+        """Publish what the loop has written since this was done last."""
         s = self.servo
         assert s is not None
-        s.look_ahead()
         samples = s.samples()
-        self._follow_phase()
         if not len(samples):
             return
         self._last = samples
         ends = np.flatnonzero(np.diff(samples.number) != 1) + 1
         for part in np.split(np.arange(len(samples)), ends):
             self.blocks.publish(self._block(samples, part))
-        error = np.nan_to_num(np.abs(samples.reference - samples.deflection), nan=np.inf)
-        self._errors.append((samples.instant[-1], float(error.max())))
+        error = np.abs(samples.reference - samples.deflection)
+        self._errors.append(
+            (samples.instant[-1], float(np.max(error, where=error >= 0, initial=0)))
+        )
         while self._errors[0][0] < samples.instant[-1] - STATE_PERIOD:
             self._errors.pop(0)
         if samples.instant[-1] - self._told >= self.parameters.sample_period:

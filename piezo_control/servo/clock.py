@@ -66,13 +66,13 @@ def begin(clock: Clock) -> None:
 def wait_for_edge(clock: Clock) -> int:
     """Wait for the next edge and return how late (ns) it is served.
 
-    Edges lie on a fixed grid. Those that have passed already are counted as missed and left out: the loop
-    never runs after lost time in a burst.
+    Edges lie on a fixed grid. Those that passed more than half a period ago are counted as missed and left
+    out: the loop never runs after lost time in a burst.
     """
     edge = clock.edge[0] + clock.period
     instant = now(clock)
-    if instant >= edge + clock.period:
-        missed = (instant - edge) // clock.period
+    missed = (instant - edge + clock.period // 2) // clock.period
+    if missed > 0:
         edge += missed * clock.period
         clock.missed[0] += missed
         clock.number[0] += missed

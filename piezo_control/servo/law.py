@@ -63,8 +63,8 @@ CAUSES: dict[int, Callable[[float, ServoParameters], str]] = {
     SENSOR_SILENT: lambda v, p: f"no reading of the sensor for {p.hold_time:g} s",
     SENSOR_OLD: lambda v, p: f"readings are {v:.3g} s old, must be at most {p.age_limit:g} s",
     SENSOR_FROZEN: lambda v, p: (
-        f"the sensor's reading stands still at {v * 1e6:.3f} µm while the voltage moved by "
-        f"{p.frozen_voltage:g} V"
+        f"the sensor's reading stands still at {v * 1e6:.3f} µm for {p.frozen_time:g} s while the voltage "
+        f"moved by {p.frozen_voltage:g} V"
     ),
     SENSOR_RANGE: lambda v, p: (
         f"the sensor says {v * 1e6:.4g} µm, must be within [{p.sensor_low * 1e6:g}, "
@@ -96,6 +96,7 @@ class Settings(NamedTuple):
     sensor_high: float
     age_limit: float
     hold_samples: float
+    frozen_samples: float
     frozen_voltage: float
     model_tolerance: float
     cycle_amplitude: float
@@ -139,7 +140,8 @@ class Watch(NamedTuple):
     times: np.ndarray  # faults since the last reset
     silent: np.ndarray  # samples without a reading
     raw: np.ndarray  # the last reading, in the card's unit
-    raw_voltage: np.ndarray  # the voltage at which it changed last
+    same: np.ndarray  # samples since it changed
+    raw_voltage: np.ndarray  # the voltage at which it changed
     command: np.ndarray
     in_use: np.ndarray  # which controller; -1 before the first sample
     samples: np.ndarray  # of this window
@@ -169,6 +171,7 @@ def settings_of(
         p.sensor_high,
         p.age_limit,
         p.hold_time / sample_time,
+        p.frozen_time / sample_time,
         p.frozen_voltage,
         p.model_tolerance,
         p.cycle_amplitude,
@@ -326,13 +329,15 @@ def judge_reading(c: Settings, w: Watch, raw: float, age: float, voltage: float)
     if raw != w.raw[0]:
         w.raw[0] = raw
         w.raw_voltage[0] = voltage
+        w.same[0] = 0.0
+    w.same[0] += 1.0
     if not is_physical(deflection, LARGEST_DEFLECTION) or not (
         c.sensor_low <= deflection <= c.sensor_high
     ):
         trip(w, SENSOR_RANGE, deflection)
     elif age > c.age_limit:
         trip(w, SENSOR_OLD, age)
-    elif abs(voltage - w.raw_voltage[0]) > c.frozen_voltage:
+    elif w.same[0] > c.frozen_samples and abs(voltage - w.raw_voltage[0]) > c.frozen_voltage:
         trip(w, SENSOR_FROZEN, deflection)
 
 

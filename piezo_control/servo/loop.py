@@ -7,6 +7,7 @@ and writes what it measured into a ring. It never waits for anybody.
 
 from __future__ import annotations
 
+import atexit
 import math
 import threading
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
-from piezo_control.safety import FAULT, NORMAL
+from piezo_control.safety import FAULT, NORMAL, RAMPING
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
 from piezo_control.servo.driver import FAILED, FRESH
 from piezo_control.servo.driver import read_card as read
@@ -125,14 +126,14 @@ def run(loop: Loop, device: Any) -> None:
         if loop.orders.reset[0] != resets:
             resets = loop.orders.reset[0]
             rearm(loop.watch)
-        if loop.orders.stop[0] != 0:
+        if loop.orders.stop[0] != 0 and loop.watch.phase[0] < RAMPING:
             trip(loop.watch, STOPPED, 0.0)
         judge_time(loop.settings, loop.watch, late * 1e-9, float(clock.missed[0] - missed))
         written = FRESH
         if loop.at_next_edge:
             written = write(device, voltage / loop.amplifier_gain, clock.edge[0])
-            # The next voltage goes out no sooner than at the next edge.
-            share = min(1.0, (period - late) / period)
+            # The next voltage goes out no sooner than at the next edge, or half a period after it.
+            share = max(0.0, (period - late) / period)
         status = read(device, clock.edge[0])
         if not loop.at_next_edge:
             share = min(1.0, (now(clock) - put_out) / period)
@@ -143,6 +144,9 @@ def run(loop: Loop, device: Any) -> None:
             put_out = now(clock)
             if write(device, voltage / loop.amplifier_gain, clock.edge[0]) == FAILED:
                 trip(loop.watch, DEVICE, 0.0)
+    if loop.at_next_edge:
+        wait_for_edge(clock)
+        write(device, voltage / loop.amplifier_gain, clock.edge[0])
 
 
 def sample(loop: Loop, status: int, reading: np.ndarray, share: float) -> float:
@@ -251,7 +255,8 @@ class Servo:
         self._run = loop_with(driver)
         self._taken = 0
         self.lost = 0
-        self._thread = threading.Thread(target=self._work, name="servo")
+        # The end of the program, whatever ends it, ends the loop with the voltage at rest.
+        self._thread = threading.Thread(target=self._work, name="servo", daemon=True)
         self.refer(Profile([0.0], [0.0]))
 
     def start(self) -> None:
@@ -262,6 +267,7 @@ class Servo:
         self._loop.orders.stop[0] = 0
         self._loop.watch.phase[0] = NORMAL
         self._thread.start()
+        atexit.register(self.stop)
 
     def _work(self) -> None:
         self.complaint = become_real_time(*self._thread_options)
@@ -274,6 +280,7 @@ class Servo:
 
     def stop(self) -> None:
         """Bring the voltage to rest, end the loop and close the device."""
+        atexit.unregister(self.stop)
         self._loop.orders.stop[0] = 1
         if self._thread.ident is not None:
             self._thread.join()

@@ -40,10 +40,17 @@ class ServoParameters(SafetyParameters):
     age_limit: float = parameter(
         1e-2, "a reading older than this is not acted upon", unit="s", low=1e-6, high=10.0
     )
-    frozen_voltage: float = parameter(
-        4.0, "a sensor is frozen if its reading stays exactly the same while the voltage moves so far",
-        unit="V", low=1e-3, high=LARGEST_VOLTAGE,
+    frozen_time: float = parameter(
+        1e-2, "a sensor is frozen if its reading stays exactly the same for so long …", unit="s",
+        low=1e-4, high=10.0,
     )  # fmt: skip
+    frozen_voltage: float = parameter(
+        4.0,
+        "… and the voltage has moved so far meanwhile",
+        unit="V",
+        low=1e-3,
+        high=LARGEST_VOLTAGE,
+    )
     model_tolerance: float = parameter(
         30e-6, "how far the deflection may be from what the model says of the voltage; an object in the "
         "way takes up to the whole stroke", unit="m", low=1e-9, high=LARGEST_DEFLECTION,
@@ -60,7 +67,7 @@ class ServoParameters(SafetyParameters):
         high=10.0,
     )
     missed_limit: int = parameter(
-        20, "periods missed one after the other that end in a fault", low=0, high=10**6
+        100, "periods missed one after the other that end in a fault", low=0, high=10**6
     )
     late_share: float = parameter(
         0.1, "share of the periods of five windows that may be late by half a period, or missed",

@@ -1,0 +1,473 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The servo: its law against the engine, every guard on its cause, the loop in real time, the node."""
+
+import json
+import math
+import signal
+import subprocess
+import sysconfig
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rclpy
+from ament_index_python.packages import get_package_prefix
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rcl_interfaces.srv import SetParameters
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
+
+from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.feedback import read_controller
+from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
+from piezo_control.parameters import ParameterError
+from piezo_control.profile import Profile
+from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING
+from piezo_control.servo import law
+from piezo_control.servo.driver import FAILED, FRESH, NONE_IN_TIME, DriverError, SharedLibrary
+from piezo_control.servo.law import laws_of, put_controller, servo_step, settings_of, watch_at_rest
+from piezo_control.servo.loop import Servo
+from piezo_control.servo.parameters import ServoParameters
+from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
+from piezo_sim.driver import Simulation
+from piezo_sim.engine import run
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.temperature import TemperatureParameters
+
+H = 1e-4
+ROBUST = read_controller("robust")
+PAPER = read_controller("paper")
+STEP = Profile([0.0, 0.01], [0.0, 20e-6])
+TIMEOUT = 120.0
+
+
+class Bench:
+    """The law of the servo, without its clock, on a cantilever."""
+
+    def __init__(self, feedback=ROBUST, plant=None, feedforward=None, **parameters):
+        self.parameters = ServoParameters(**parameters)
+        self.feedforward = feedforward or FeedforwardParameters()
+        self.settings = settings_of(self.parameters, self.feedforward, H)
+        self.laws = laws_of(feedback, Feedforward(self.feedforward, H))
+        self.watch = watch_at_rest()
+        self.plant = Cantilever(plant or CantileverParameters())
+        self.voltages = []
+        self.wanted = 0
+
+    def step(self, reference, status=FRESH, raw=None, age=0.0, share=1.0):
+        reading = self.plant.measure() if raw is None else raw
+        voltage = servo_step(
+            self.settings,
+            self.laws,
+            self.watch,
+            self.wanted,
+            status,
+            reading,
+            age,
+            reference,
+            share,
+        )
+        self.plant.advance(voltage, 22.0)
+        self.voltages.append(voltage)
+        return voltage
+
+    def run(self, samples, reference=20e-6, **more):
+        for _ in range(samples):
+            self.step(reference, **more)
+
+    @property
+    def cause(self):
+        code = int(self.watch.cause[0])
+        return law.CAUSES[code](float(self.watch.cause_value[0]), self.parameters) if code else ""
+
+    def assert_at_rest(self, within):
+        """The voltage went to rest within `within` seconds, by no more than ramp and slew limit allow."""
+        self.run(round(within / H))
+        assert self.watch.phase[0] == FAULT
+        assert self.voltages[-1] == 0.0
+        assert np.abs(np.diff(self.voltages)).max() <= self.feedforward.slew_limit * H * (1 + 1e-9)
+        assert np.abs(self.voltages).max() <= 40.0
+
+
+def test_the_law_gives_the_samples_of_the_engine():
+    samples = 600
+    expected = run(
+        CantileverParameters(),
+        FeedforwardParameters(),
+        ROBUST,
+        TemperatureParameters(),
+        STEP,
+        samples,
+    )
+    bench = Bench()
+    for k in range(samples):
+        bench.step(STEP.at(k * H))
+    # The engine is compiled with contractions of its own; the sensor's steps of 10 nm hide them.
+    np.testing.assert_allclose(bench.voltages, expected.voltage, rtol=0, atol=1e-9)
+
+
+@pytest.fixture
+def running():
+    """A bench that has settled at 20 µm."""
+    bench = Bench()
+    bench.run(200)
+    assert bench.watch.phase[0] == NORMAL
+    assert bench.plant.measure() == pytest.approx(20e-6, rel=0.05)
+    return bench
+
+
+def test_a_late_reading_is_bridged_and_a_silent_sensor_ends_at_rest(running):
+    held = running.voltages[-1]
+    running.run(500, status=NONE_IN_TIME)  # 50 ms, the hold time being 100 ms
+    assert running.watch.phase[0] == HOLDING
+    assert set(running.voltages[-500:]) == {held}
+    running.run(1)
+    assert running.watch.phase[0] == NORMAL
+    running.run(1001, status=NONE_IN_TIME)
+    assert running.watch.phase[0] == RAMPING
+    assert running.cause == "no reading of the sensor for 0.1 s"
+    running.assert_at_rest(0.01)  # 37 V at 1e4 V/s: 3.7 ms
+
+
+@pytest.mark.parametrize(
+    "more, cause",
+    [
+        ({"status": FAILED}, "the device failed"),
+        ({"age": 0.02}, "readings are 0.02 s old, must be at most 0.01 s"),
+        ({"raw": 41e-6}, r"the sensor says 41 µm, must be within [-40, 40] µm"),
+        ({"raw": math.nan}, "the sensor says nan µm"),
+        ({"raw": 1.7e308}, "the sensor says"),
+        ({"raw": -12e-6}, "µm from what the model says of the voltage, must be within 30 µm"),
+    ],
+)
+def test_what_no_loop_can_use_ends_at_rest_at_once(running, more, cause):
+    running.run(1, **more)
+    assert running.watch.phase[0] == RAMPING
+    assert cause in running.cause
+    running.assert_at_rest(0.01)
+
+
+def test_a_fault_stays_until_it_is_reset_and_then_the_loop_takes_over_from_rest(running):
+    running.run(1, status=FAILED)
+    running.assert_at_rest(0.5)
+    running.run(1000)
+    assert running.voltages[-1] == 0.0 and running.watch.times[0] == 1.0
+    law.rearm(running.watch)
+    running.run(1)
+    assert abs(running.voltages[-1]) < 4.0  # one step of the slew limit
+    running.run(300)
+    assert running.plant.measure() == pytest.approx(20e-6, rel=0.05)
+    assert np.abs(np.diff(running.voltages)).max() <= 4.0 + 1e-9
+
+
+def test_a_frozen_sensor_is_found_once_the_voltage_has_moved(running):
+    frozen = running.plant.measure()
+    for k in range(2000):
+        running.step(20e-6 - 2e-8 * k, raw=frozen)
+        if running.watch.phase[0] == RAMPING:
+            break
+    assert "stands still at" in running.cause
+    running.assert_at_rest(0.02)
+
+
+def test_a_reversed_sensor_is_found_within_20_ms():
+    bench = Bench(sensor_scale=-1.0)
+    bench.run(200)
+    assert bench.cause.endswith("polarity, scale or wiring?") or "the sensor says" in bench.cause
+    bench.assert_at_rest(0.02)
+
+
+def test_polarity_zero_and_scale_of_sensor_are_undone():
+    """A sensor of -5 V/mm with 1 V at zero, in the loop, gives the voltages of one in metres."""
+    plain, scaled = Bench(), Bench(sensor_scale=-2e-4, sensor_zero=1.0)
+    for _ in range(300):
+        plain.step(20e-6)
+        scaled.step(20e-6, raw=1.0 - scaled.plant.measure() / 2e-4)
+    np.testing.assert_allclose(plain.voltages, scaled.voltages, rtol=0, atol=1e-6)
+
+
+def test_a_loop_that_oscillates_ends_at_rest():
+    """Four more samples of delay turn `robust`, whose delay margin is 0.26 ms, unstable."""
+    plant = CantileverParameters()
+    bench = Bench(plant=replace(plant, sensor=replace(plant.sensor, delay_samples=5)))
+    for _ in range(6000):
+        bench.step(5e-6)
+        if bench.watch.phase[0] == RAMPING:
+            break
+    assert len(bench.voltages) <= 2500  # five windows of 20 ms, once the swing is beyond 5 µm
+    assert "the loop oscillates by" in bench.cause or "model says" in bench.cause
+    bench.assert_at_rest(0.02)
+
+
+def test_the_ringing_of_an_open_loop_step_and_a_fast_reference_are_no_oscillation():
+    bench = Bench(FeedbackParameters())
+    bench.run(3000)
+    assert bench.watch.phase[0] == NORMAL
+    for k in range(4000):
+        bench.step(20e-6 * math.sin(2 * math.pi * 100 * k * H))
+    assert bench.watch.phase[0] == NORMAL
+
+
+def test_missed_and_late_periods_end_at_rest(running):
+    law.judge_time(running.settings, running.watch, 0.0, 100.0)
+    assert running.watch.phase[0] == NORMAL
+    law.judge_time(running.settings, running.watch, 0.0, 101.0)
+    assert running.cause == "101 periods missed in a row, must be at most 100"
+    running.assert_at_rest(0.01)
+
+
+def test_a_share_of_late_periods_is_judged_over_five_windows(running):
+    for k in range(1000):  # five windows of 20 ms
+        law.judge_time(running.settings, running.watch, 0.6e-4 if k % 9 == 0 else 0.0, 0.0)
+    assert running.cause == "11.2% of the periods are late or missed, must be at most 10.0%"
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(0.0, 1.0), min_size=20, max_size=60), st.integers(0, 2**32 - 1))
+def test_limits_hold_in_time_whatever_the_reference_and_the_sensor_do(shares, seed):
+    random = np.random.default_rng(seed)
+    bench = Bench()
+    last = 0.0
+    for share in shares:
+        status = random.choice(
+            [FRESH, FRESH, FRESH, NONE_IN_TIME, FAILED], p=[0.3, 0.3, 0.3, 0.09, 0.01]
+        )
+        voltage = bench.step(random.uniform(-1e-3, 1e-3), status=status, share=share)
+        assert abs(voltage - last) <= 4e4 * H * share + 1e-12
+        assert abs(voltage) <= 40.0
+        last = voltage
+
+
+def test_another_controller_takes_over_with_the_command_where_it_is(running):
+    put_controller(running.laws.controllers[1], PAPER)
+    command = running.watch.command[0]
+    running.wanted = 1
+    running.step(20e-6)
+    assert running.watch.command[0] == pytest.approx(command, abs=0.2e-6)
+    running.run(500)
+    # The paper's K leaves 0.68 % of static error (docs: control-reference).
+    assert running.plant.measure() == pytest.approx(20e-6, rel=0.02)
+
+
+# --- the loop in real time, without ROS -------------------------------------------------------------
+
+PATIENT = ServoParameters(missed_limit=10**6, late_share=1.0)  # other processes share this machine
+
+
+def wait(done, what="the condition"):
+    end = time.monotonic() + TIMEOUT
+    while not done():
+        assert time.monotonic() < end, what
+        time.sleep(0.005)
+
+
+def test_a_servo_in_this_process():
+    servo = Servo(Simulation("", H), PATIENT, ROBUST, FeedforwardParameters())
+    taken = []
+
+    def collect():
+        servo.look_ahead()
+        taken.append(servo.samples())
+
+    def settled(at):
+        collect()
+        return len(taken[-1]) and abs(taken[-1].deflection[-1] - at) < 0.2e-6
+
+    servo.start()
+    try:
+        wait(lambda: servo.number > 100)
+        servo.refer(Profile([0.0], [20e-6]))
+        wait(lambda: settled(20e-6))
+        servo.change_controller(PAPER)
+        wait(lambda: collect() or servo._loop.watch.in_use[0] == 1)
+        servo.refer(Profile([0.0], [-10e-6]))
+        wait(lambda: settled(-10e-6))
+    finally:
+        servo.stop()
+    collect()
+    number = np.concatenate([s.number for s in taken])
+    instant = np.concatenate([s.instant for s in taken])
+    voltage = np.concatenate([s.voltage for s in taken])
+    assert servo.lost == 0
+    assert (np.diff(number) > 0).all()
+    assert (
+        number[-1] + 1 - len(number) == servo.missed
+    )  # the numbers left out are those that were missed
+    # Edges on one grid, however late they were served.
+    np.testing.assert_allclose(instant, instant[0] + (number - number[0]) * H, rtol=0, atol=1e-6)
+    assert np.abs(np.diff(voltage)).max() <= 4.0 + 1e-9
+    assert (servo.phase, servo.cause, voltage[-1]) == (FAULT, "stopped", 0.0)
+
+
+def test_a_device_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(
+        ParameterError, match="must be 'simulated', one of the shipped udp, or the path"
+    ):
+        SharedLibrary("nowhere", "", H)
+    with pytest.raises(DriverError, match="options are 'nonsense', must be HOST:PORT"):
+        SharedLibrary("udp", "nonsense", H)
+    no_driver = tmp_path / "empty.so"
+    no_driver.write_bytes(b"no library")
+    with pytest.raises(ParameterError, match="'driver' is"):
+        SharedLibrary(str(no_driver), "", H)
+
+
+def test_the_example_driver_compiles_without_a_warning(tmp_path):
+    compiler = sysconfig.get_config_var("CC").split()[0]
+    sources = Path(__file__).parents[1] / "piezo_control" / "servo" / "drivers"
+    for source in sources.glob("*.c"):
+        subprocess.run(
+            [compiler, "-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fPIC", "-shared",
+             "-o", tmp_path / "driver.so", source],
+            check=True, timeout=TIMEOUT,
+        )  # fmt: skip
+
+
+# --- the node, against a finger in another process --------------------------------------------------
+
+EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
+
+
+class Stand:
+    """A UDP finger, the servo and what one needs to talk to it; every wait is for a condition."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        (folder / "finger.yaml").write_text(
+            "/**/cantilever:\n  ros__parameters: {sensor: {delay_samples: 0}}\n"
+        )
+        self.port = 0
+        self.finger = self.start_finger()
+        self.servo = self.start(
+            "servo", "--ros-args", "-p", "driver:=udp", "-p", f"driver_options:=127.0.0.1:{self.port}",
+            "-p", "write:=next_edge", "-p", "delay_samples:=0", "-p", "late_share:=1.0",
+            "-p", "missed_limit:=1000000", "-p", "age_limit:=10.0", "-p", "hold_time:=2.0",
+        )  # fmt: skip
+        self.node = rclpy.create_node("stand")
+        self.executor = EventsExecutor()
+        self.executor.add_node(self.node)
+        self.states, self.blocks = [], []
+        self.node.create_subscription(FingerState, "state", self.states.append, LATCHED)
+        self.node.create_subscription(SampleBlock, "samples", self.blocks.append, SAMPLE)
+        self.reference = self.node.create_publisher(Sample, "reference", SETPOINT)
+
+    def start(self, name, *arguments):
+        with (self.folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                [EXECUTABLES / name, *arguments], stdout=log, stderr=log, start_new_session=True
+            )
+
+    def log(self, name):
+        return (self.folder / f"{name}.log").read_text()
+
+    def start_finger(self):
+        before = self.log("udp_finger").count("answers") if self.port else 0
+        finger = self.start(
+            "udp_finger", "--port", str(self.port), "--cantilever", str(self.folder / "finger.yaml"),
+            "--report", str(self.folder / "report.json"),
+        )  # fmt: skip
+        wait(lambda: self.log("udp_finger").count("answers") > before, "the finger answers")
+        self.port = int(self.log("udp_finger").rsplit(":", 1)[1].split()[0])
+        return finger
+
+    def wait(self, done):
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            assert time.monotonic() < end, self.log("servo") + self.log("udp_finger")
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def call(self, kind, name, request):
+        client = self.node.create_client(kind, name)
+        self.wait(client.service_is_ready)
+        future = client.call_async(request)
+        self.wait(future.done)
+        return future.result()
+
+    def is_at(self, deflection):
+        last = self.blocks[-1] if self.blocks else None
+        return last and np.nanmax(np.abs(np.array(last.deflection) - deflection)) < 0.2e-6
+
+    @property
+    def phase(self):
+        return self.states[-1].phase if self.states else None
+
+
+@pytest.fixture
+def stand(tmp_path):
+    rclpy.init()
+    stand = Stand(tmp_path)
+    try:
+        yield stand
+    finally:
+        for process in (stand.servo, stand.finger):
+            process.terminate()
+        codes = [process.wait(TIMEOUT) for process in (stand.servo, stand.finger)]
+        stand.executor.shutdown()
+        stand.node.destroy_node()
+        rclpy.shutdown()
+    assert codes == [0, 0]
+
+
+def test_servo_node(stand):
+    stand.wait(lambda: stand.phase == FingerState.RUNNING)
+    # A second step of 20 µm: from rest to where `robust` is certified to settle.
+    stand.reference.publish(Sample(value=20e-6))
+    stand.wait(lambda: stand.is_at(20e-6))
+    stand.wait(lambda: stand.states[-1].on_target)
+    # Another controller while it runs, and what cannot be taken is refused.
+    for name, taken in (("paper", True), ("robsut", False)):
+        change = Parameter("controller_file", value=name).to_parameter_msg()
+        answer = stand.call(
+            SetParameters, "servo/set_parameters", SetParameters.Request(parameters=[change])
+        )
+        assert answer.results[0].successful == taken
+    assert "not one of the shipped" in answer.results[0].reason
+    stand.wait(lambda: "controller 'paper' takes over" in stand.log("servo"))
+    # The finger dies: held, then at rest with a fault that names it, until a reset.
+    stand.finger.kill()
+    stand.finger.wait()
+    stand.wait(lambda: stand.phase == FingerState.FAULT)
+    assert stand.states[-1].text == "no reading of the sensor for 2 s"
+    assert stand.states[-1].voltage == 0.0
+    stand.finger = stand.start_finger()
+    assert stand.call(Trigger, "servo/reset", Trigger.Request()).success
+    stand.wait(lambda: stand.phase == FingerState.RUNNING and stand.is_at(20e-6))
+    # Nothing of what was published breaks a limit, and the finger saw nothing else.
+    voltage = np.concatenate([block.voltage for block in stand.blocks])
+    assert np.abs(np.diff(voltage)).max() <= 4.0 + 1e-9
+    stand.servo.send_signal(signal.SIGHUP)  # as of a terminal that is closed
+    assert stand.servo.wait(TIMEOUT) == 0
+    stand.finger.terminate()
+    assert stand.finger.wait(TIMEOUT) == 0
+    report = json.loads((stand.folder / "report.json").read_text())
+    assert report["last_voltage"] == 0.0
+    assert -40.0 <= report["lowest_voltage"] and report["highest_voltage"] <= 40.0
+    if not report["lost_datagrams"]:
+        assert report["largest_step"] <= 4.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    "arguments, text",
+    [
+        (["-p", "driver:=nowhere"], "'driver' is 'nowhere', must be 'simulated'"),
+        (["-p", "controller_file:=robsut"], "not one of the shipped"),
+        (["-p", "write:=next_edge"], "was designed for a delay of 1 samples, this loop has 2"),
+        (["-p", "feedforward_file:=/none.yaml"], "/none.yaml: cannot be read"),
+    ],
+)
+def test_what_cannot_start_says_why(tmp_path, arguments, text):
+    log = tmp_path / "servo.log"
+    with log.open("wb") as out:
+        command = [EXECUTABLES / "servo", "--ros-args", *arguments]
+        servo = subprocess.Popen(command, stdout=out, stderr=out)
+    try:
+        wait(lambda: text in log.read_text(), f"'{text}' in the log")
+    finally:
+        servo.terminate()
+        assert servo.wait(TIMEOUT) == 0
+    assert "Traceback" not in log.read_text()
