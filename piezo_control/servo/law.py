@@ -296,12 +296,14 @@ def servo_step(
     order = k.order[0]
     x = laws.states.x[:order]
     if w.in_use[0] != wanted:
-        # A new controller begins with the command at which the finger is: no bump.
+        # A new controller begins with the command at which the finger is: no bump. The first one begins as if
+        # the reference had been where the finger is, so that a reference elsewhere is a step.
         command = modelled_deflection(laws.feedforward, laws.feedforward_state)
         command = min(max(command, k.command_low[0]), k.command_high[0])
+        before = deflection if w.in_use[0] < 0.0 else reference
         for i in range(order):
             x[i] = (
-                k.hand_over[3 * i] * reference
+                k.hand_over[3 * i] * before
                 + k.hand_over[3 * i + 1] * deflection
                 + k.hand_over[3 * i + 2] * command
             )
