@@ -7,7 +7,7 @@ out: recorder_state (RecorderState)
 A recording begins at activation and is finished, readable, at deactivation, shutdown, SIGINT and
 SIGTERM. Numbered samples are written once each, whatever the transport repeats; numbers never seen are
 counted as missing. A message's time in the bag is its own stamp, so a lock-step run replays at the
-finger's speed. A run that starts again at sample 0 goes on in the same bag.
+finger's speed; one without a stamp, as of `ros2 topic pub`, has that of the newest sample. A run that starts again at sample 0 goes on in the same bag.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import RecorderParameters
 from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_control.recording.recording import PROFILE_TYPE, SAMPLE_TYPE, TEMPERATURE_TYPE
+from piezo_control.recording.recording import (
+    BLOCK_TYPE,
+    PROFILE_TYPE,
+    SAMPLE_TYPE,
+    TEMPERATURE_TYPE,
+)
 from piezo_control.recording.writer import BagWriter
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import RecorderState
@@ -39,6 +44,7 @@ FINGER = {
     "deflection": (SAMPLE_TYPE, SAMPLE),
     "command": (SAMPLE_TYPE, SAMPLE),
     "voltage": (SAMPLE_TYPE, SAMPLE),
+    "samples": (BLOCK_TYPE, SAMPLE),
     "temperature": (TEMPERATURE_TYPE, SAMPLE),
     "tip_force": (SAMPLE_TYPE, SAMPLE),
     "tip_force_profile": (PROFILE_TYPE, LATCHED),
@@ -56,6 +62,7 @@ class Track:
         self.connection = connection
         self.has_header = has_header
         self.is_numbered = connection.msgtype == SAMPLE_TYPE and topic not in SET_POINTS
+        self.is_block = connection.msgtype == BLOCK_TYPE
         self.is_stamped = connection.msgtype == TEMPERATURE_TYPE
         self.sequence = Sequence(gaps=True)
         self.last_stamp = -1
@@ -110,6 +117,8 @@ class RecorderNode(FingerNode):
         bag = Path(self.parameters.bag or time.strftime("finger_%Y-%m-%d_%H-%M-%S"))
         writer = BagWriter(bag)
         self.tracks = {}
+        self.newest = 0
+        self.unstamped: list[tuple[str, bytes]] = []
         for topic, (name, qos) in self.types.items():
             if name not in writer.typestore.types:
                 package = name.split("/")[0]
@@ -126,6 +135,9 @@ class RecorderNode(FingerNode):
         writer, self.writer = self.writer, None
         if writer is None:
             return  # given up before
+        self.writer = writer
+        self._tell_time(self.newest or self.get_clock().now().nanoseconds)
+        self.writer = None
         try:
             writer.close()
         except OSError as error:
@@ -164,6 +176,12 @@ class RecorderNode(FingerNode):
         if track.has_header:
             seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
             stamp = seconds * 10**9 + nanoseconds
+            if track.is_numbered or track.is_block:
+                self._tell_time(max(stamp, self.newest, 1))
+            elif not stamp and not self.newest:
+                self.unstamped.append((topic, data))  # until a sample says what time it is
+                return
+            stamp = stamp or self.newest
         else:
             stamp = self.get_clock().now().nanoseconds
         if track.is_numbered and not self._is_new(track, sample_number(data)):
@@ -179,6 +197,12 @@ class RecorderNode(FingerNode):
             self._give_up(self.writer, error)
             return
         track.recorded += 1
+
+    def _tell_time(self, newest: int) -> None:
+        """Take note of the time (ns) of the newest sample; what waited for one is written."""
+        self.newest = newest
+        while self.unstamped:
+            self._write(*self.unstamped.pop(0))
 
     def _is_new(self, track: Track, number: int) -> bool:
         """Count sample `number` of a topic and say whether it has not been written yet."""
@@ -196,7 +220,9 @@ class RecorderNode(FingerNode):
             for other in self.tracks.values():
                 other.sequence = Sequence(gaps=True)
                 other.last_stamp = -1
-        track.missing += number - max(track.sequence.next, 0)
+        if not any(other.is_block and other.recorded for other in self.tracks.values()):
+            # Beside blocks, single samples are a selection.
+            track.missing += number - max(track.sequence.next, 0)
         track.sequence.count(number)
         return True
 

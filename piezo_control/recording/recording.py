@@ -17,6 +17,7 @@ __all__ = ["BagError", "Recording", "read"]
 
 SAMPLE_TYPE = "piezo_gripper_msgs/msg/Sample"
 PROFILE_TYPE = "piezo_gripper_msgs/msg/Profile"
+BLOCK_TYPE = "piezo_gripper_msgs/msg/SampleBlock"
 TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
 LINEAR = 1  # Profile.interpolation: straight lines
 
@@ -78,29 +79,20 @@ def read(
         raise BagError(
             f"{path}: {bag.damage}; could be read: {bag.content()}; to use that, ask for a partial reading"
         )
-    topic = _deflection_topic(bag, finger)
-    prefix = topic[: -len("deflection")]
-    deflection = _choose_run(bag, topic, bag.messages(topic, SAMPLE_TYPE), run)
-    number, first = np.unique([m.number for m in deflection], return_index=True)
-    stamps = np.array([_seconds(deflection[i].header.stamp) for i in first])
-    period = _period(stamps, number)
-    signals = {
-        name: _signal(bag, prefix + name, stamps, number * period)
-        for name in ("reference", "tip_force")
-    }
-    sampled = {
-        name: _align(number, bag.messages(prefix + name, SAMPLE_TYPE), stamps)
-        for name in ("command", "voltage")
-    }
+    prefix = _prefix(bag, finger)
+    signals = _from_blocks(bag, prefix, run) or _from_samples(bag, prefix, run)
+    number, stamps, received = (signals.pop(name) for name in ("number", "stamps", "received"))
+    elapsed = number * _period(stamps, number)
+    for name in ("reference", "tip_force"):
+        if name not in signals:
+            signals[name] = _signal(bag, prefix + name, received, elapsed)
     warmth = bag.messages(f"{prefix}temperature", TEMPERATURE_TYPE)
     recording = Recording(
         number=number,
         time=stamps - stamps[0],
-        deflection=np.array([deflection[i].value for i in first]),
         temperature=_held(
             [_seconds(m.header.stamp) for m in warmth], [m.temperature for m in warmth], stamps
         ),
-        **sampled,
         **signals,
     )
     return _without_ragged_end(recording) if bag.damage else recording
@@ -114,28 +106,71 @@ def _without_ragged_end(recording: Recording) -> Recording:
     return Recording(**{name: signal[:end] for name, signal in signals.items()})
 
 
-def _deflection_topic(bag: Bag, finger: str) -> str:
-    found = [topic for topic in bag.topics if topic.split("/")[-1] == "deflection"]
+def _prefix(bag: Bag, finger: str) -> str:
+    """Return the namespace of the finger in the bag, with its '/'."""
+    last = ("deflection", "samples")
+    found = sorted({t[: -len(t.split("/")[-1])] for t in bag.topics if t.split("/")[-1] in last})
     if finger:
-        found = [topic for topic in found if topic == f"/{finger.strip('/')}/deflection"]
+        found = [prefix for prefix in found if prefix == f"/{finger.strip('/')}/"]
     if len(found) != 1:
         which = "several fingers, name one of" if found else f"no topic '{finger}/deflection' in"
         raise BagError(f"{bag.path}: {which}: {bag.content()}")
-    if not bag.topics[found[0]].data:
-        raise BagError(f"{bag.path}: topic '{found[0]}' has no messages; there is: {bag.content()}")
+    topics = [found[0] + name for name in last if found[0] + name in bag.topics]
+    if not any(bag.topics[topic].data for topic in topics):
+        raise BagError(
+            f"{bag.path}: topic '{topics[0]}' has no messages; there is: {bag.content()}"
+        )
     return found[0]
 
 
-def _choose_run(bag: Bag, topic: str, samples: list[Any], run: int | None) -> list[Any]:
-    """Return the samples of one run; where numbers go back, another one begins."""
-    number = np.array([m.number for m in samples])
+def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
+    """Return number, stamps (s) and signals of a loop that was recorded in blocks; nothing if it was not."""
+    topic = f"{prefix}samples"
+    blocks = bag.messages(topic, BLOCK_TYPE)
+    if not blocks:
+        return {}
+    blocks = blocks[_choose_run(bag, topic, blocks, run)]
+    counts = [np.arange(len(block.deflection)) for block in blocks]
+    number = np.concatenate([block.number + n for block, n in zip(blocks, counts)])
+    stamps = [_seconds(b.header.stamp) + b.period * n for b, n in zip(blocks, counts)]
+    names = ("reference", "deflection", "command", "voltage")
+    signals = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
+    signals["stamps"] = np.concatenate(stamps)
+    signals["received"] = np.round(1e9 * signals["stamps"])
+    number, first = np.unique(number.astype(np.int64), return_index=True)
+    return {"number": number, **{name: signal[first] for name, signal in signals.items()}}
+
+
+def _from_samples(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
+    """Return number, stamps (s) and signals of a loop that was recorded sample by sample."""
+    topic = f"{prefix}deflection"
+    messages = bag.messages(topic, SAMPLE_TYPE)
+    chosen = _choose_run(bag, topic, messages, run)
+    deflection, received = messages[chosen], np.array(bag.topics[topic].stamps[chosen])
+    number, first = np.unique([m.number for m in deflection], return_index=True)
+    stamps = np.array([_seconds(deflection[i].header.stamp) for i in first])
+    return {
+        "number": number,
+        "stamps": stamps,
+        "received": received[first],
+        "deflection": np.array([deflection[i].value for i in first]),
+        **{
+            name: _align(number, bag.messages(prefix + name, SAMPLE_TYPE), stamps)
+            for name in ("command", "voltage")
+        },
+    }
+
+
+def _choose_run(bag: Bag, topic: str, messages: list[Any], run: int | None) -> slice:
+    """Return which messages are those of one run; where numbers go back, another one begins."""
+    number = np.array([m.number for m in messages])
     begins = [0, *np.flatnonzero(np.diff(number) < 0) + 1, number.size]
     count = len(begins) - 1
     if run is None and count > 1 or run is not None and not 0 <= run < count:
         raise BagError(
             f"{bag.path}: topic '{topic}' has {count} runs (numbered from 0), and run {run} was asked for"
         )
-    return samples[begins[run or 0] : begins[(run or 0) + 1]]
+    return slice(int(begins[run or 0]), int(begins[(run or 0) + 1]))
 
 
 def _period(time: NDArray, number: NDArray) -> float:
@@ -156,16 +191,26 @@ def _align(number: NDArray, samples: list[Any], stamps: NDArray) -> NDArray[np.f
     return np.array([values.get(n, np.nan) for n in number.tolist()])
 
 
-def _signal(bag: Bag, name: str, stamps: NDArray, elapsed: NDArray) -> NDArray[np.float64]:
-    """Evaluate a signal that came as a profile (over the time `elapsed`) or else as set-points."""
-    profiles = bag.messages(f"{name}_profile", PROFILE_TYPE)
-    if profiles:
-        last = profiles[-1]
-        return Profile(last.time, last.value, last.interpolation == LINEAR).at(elapsed)
-    points = bag.messages(name, SAMPLE_TYPE)
-    received = bag.topics[name].stamps if points else []
-    instants = [_seconds(m.header.stamp) or ns * 1e-9 for m, ns in zip(points, received)]
-    return _held(instants, [m.value for m in points], stamps)
+def _signal(bag: Bag, name: str, received: NDArray, elapsed: NDArray) -> NDArray[np.float64]:
+    """Evaluate a signal that came as profiles (over the time `elapsed`) and set-points: the newest counts.
+
+    Each is in force from when it came, by the bag's own stamps, as are the samples (`received`, ns). A
+    profile that came first says what was before it, too.
+    """
+    came: list[tuple[int, bool, Profile]] = []
+    for topic, kind in ((f"{name}_profile", PROFILE_TYPE), (name, SAMPLE_TYPE)):
+        messages = bag.messages(topic, kind)
+        for m, instant in zip(messages, bag.topics[topic].stamps if messages else ()):
+            if kind == PROFILE_TYPE:
+                came.append((instant, True, Profile(m.time, m.value, m.interpolation == LINEAR)))
+            else:
+                came.append((instant, False, Profile([0.0], [m.value])))
+    came.sort(key=lambda one: one[0])
+    values = np.full(elapsed.shape, np.nan)
+    for i, (instant, is_profile, profile) in enumerate(came):
+        first = 0 if i == 0 and is_profile else int(np.searchsorted(received, instant))
+        values[first:] = profile.at(elapsed[first:])
+    return values
 
 
 def _held(instants: list[float], values: list[float], stamps: NDArray) -> NDArray[np.float64]:
