@@ -82,16 +82,16 @@ def read(
     prefix = _prefix(bag, finger)
     signals = _from_blocks(bag, prefix, run) or _from_samples(bag, prefix, run)
     number, stamps, received = (signals.pop(name) for name in ("number", "stamps", "received"))
-    elapsed = number * _period(stamps, number)
+    elapsed = number * _period((stamps - stamps[0]) * 1e-9, number)
     for name in ("reference", "tip_force"):
         if name not in signals:
             signals[name] = _signal(bag, prefix + name, received, elapsed)
     warmth = bag.messages(f"{prefix}temperature", TEMPERATURE_TYPE)
     recording = Recording(
         number=number,
-        time=stamps - stamps[0],
+        time=(stamps - stamps[0]) * 1e-9,
         temperature=_held(
-            [_seconds(m.header.stamp) for m in warmth], [m.temperature for m in warmth], stamps
+            [_nanoseconds(m.header.stamp) for m in warmth], [m.temperature for m in warmth], stamps
         ),
         **signals,
     )
@@ -124,7 +124,7 @@ def _prefix(bag: Bag, finger: str) -> str:
 
 
 def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
-    """Return number, stamps (s) and signals of a loop that was recorded in blocks; nothing if it was not."""
+    """Return number, stamps (ns) and signals of a loop that was recorded in blocks; nothing if it was not."""
     topic = f"{prefix}samples"
     blocks = bag.messages(topic, BLOCK_TYPE)
     if not blocks:
@@ -132,23 +132,26 @@ def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
     blocks = blocks[_choose_run(bag, topic, blocks, run)]
     counts = [np.arange(len(block.deflection)) for block in blocks]
     number = np.concatenate([block.number + n for block, n in zip(blocks, counts)])
-    stamps = [_seconds(b.header.stamp) + b.period * n for b, n in zip(blocks, counts)]
+    stamps = [
+        _nanoseconds(b.header.stamp) + np.round(1e9 * b.period * n).astype(np.int64)
+        for b, n in zip(blocks, counts)
+    ]
     names = ("reference", "deflection", "command", "voltage")
     signals = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
     signals["stamps"] = np.concatenate(stamps)
-    signals["received"] = np.round(1e9 * signals["stamps"])
+    signals["received"] = signals["stamps"]
     number, first = np.unique(number.astype(np.int64), return_index=True)
     return {"number": number, **{name: signal[first] for name, signal in signals.items()}}
 
 
 def _from_samples(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
-    """Return number, stamps (s) and signals of a loop that was recorded sample by sample."""
+    """Return number, stamps (ns) and signals of a loop that was recorded sample by sample."""
     topic = f"{prefix}deflection"
     messages = bag.messages(topic, SAMPLE_TYPE)
     chosen = _choose_run(bag, topic, messages, run)
     deflection, received = messages[chosen], np.array(bag.topics[topic].stamps[chosen])
     number, first = np.unique([m.number for m in deflection], return_index=True)
-    stamps = np.array([_seconds(deflection[i].header.stamp) for i in first])
+    stamps = np.array([_nanoseconds(deflection[i].header.stamp) for i in first])
     return {
         "number": number,
         "stamps": stamps,
@@ -179,14 +182,17 @@ def _period(time: NDArray, number: NDArray) -> float:
     return round(float(np.median(np.diff(time) / np.diff(number))) * 1e9) / 1e9
 
 
-def _seconds(stamp: Any) -> float:
-    return stamp.sec + stamp.nanosec * 1e-9
+def _nanoseconds(stamp: Any) -> int:
+    # A float of seconds on the clock on the wall has steps of a quarter of a microsecond.
+    return stamp.sec * 10**9 + stamp.nanosec
 
 
 def _align(number: NDArray, samples: list[Any], stamps: NDArray) -> NDArray[np.float64]:
     """Return the values of the sample `number`s, looked for between the first and the last stamp."""
     values = {
-        m.number: m.value for m in samples if stamps[0] <= _seconds(m.header.stamp) <= stamps[-1]
+        m.number: m.value
+        for m in samples
+        if stamps[0] <= _nanoseconds(m.header.stamp) <= stamps[-1]
     }
     return np.array([values.get(n, np.nan) for n in number.tolist()])
 
@@ -213,10 +219,10 @@ def _signal(bag: Bag, name: str, received: NDArray, elapsed: NDArray) -> NDArray
     return values
 
 
-def _held(instants: list[float], values: list[float], stamps: NDArray) -> NDArray[np.float64]:
+def _held(instants: list[int], values: list[float], stamps: NDArray) -> NDArray[np.float64]:
     """Return what was newest at each of `stamps`, NaN before the first."""
     if not instants:
         return np.full(stamps.shape, np.nan)
     order = np.argsort(instants, kind="stable")
-    index = np.searchsorted(np.array(instants)[order], stamps + 1e-9, side="right") - 1
+    index = np.searchsorted(np.array(instants)[order], stamps + 1, side="right") - 1
     return np.where(index >= 0, np.array(values)[order][np.maximum(index, 0)], np.nan)
