@@ -22,6 +22,7 @@ import engine
 import loop
 import matplotlib
 import numpy as np
+import servo
 from engine import row
 from rich.console import Console
 
@@ -87,6 +88,7 @@ def measure(folder: Path, histograms: dict[str, np.ndarray]) -> Iterator[list[di
     yield engine.rows()
     yield identification()
     yield synthesis(folder)
+    yield servo.rows(folder)
     yield loop.start_up(folder)
     yield loop.lockstep(folder)
     yield loop.responsiveness(folder)

@@ -34,6 +34,7 @@ def test_blocks_are_read_as_samples_and_a_missed_number_is_left_out(bag):
     for first, last in ((0, 300), (301, 400), (400, 1000)):  # number 300 was missed
         stamp = WALL + first * 100_000
         block = {name: signal[first:last] for name, signal in signals.items()}
+        block["late"] = np.zeros(last - first)
         bag.write(connection, stamp, make(bag, BLOCK_TYPE, stamp, number=first, period=H, **block))
         bag.write(
             single, stamp,

@@ -227,7 +227,7 @@ class ServoNode(FingerNode):
         assert self.servo is not None
         block = SampleBlock(number=int(samples.number[rows[0]]), period=self.servo.sample_time)
         block.header.stamp = self._stamp(samples.instant[rows[0]])
-        for name in ("reference", "deflection", "command", "voltage"):
+        for name in ("reference", "deflection", "command", "voltage", "late"):
             setattr(block, name, getattr(samples, name)[rows])
         return block
 

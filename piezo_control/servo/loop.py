@@ -88,7 +88,8 @@ class Log(NamedTuple):
 
     count: np.ndarray
     number: np.ndarray
-    instant: np.ndarray  # ns of the monotonic clock
+    instant: np.ndarray  # ns of the monotonic clock, of the edge
+    late: np.ndarray  # ns after the edge
     reference: np.ndarray
     deflection: np.ndarray
     command: np.ndarray
@@ -139,7 +140,7 @@ def run(loop: Loop, device: Any) -> None:
             share = min(1.0, (now(clock) - put_out) / period)
         if written == FAILED:
             status = FAILED
-        voltage = sample(loop, status, device.reading, share)
+        voltage = sample(loop, status, device.reading, share, late)
         if not loop.at_next_edge:
             put_out = now(clock)
             if write(device, voltage / loop.amplifier_gain, clock.edge[0]) == FAILED:
@@ -149,7 +150,7 @@ def run(loop: Loop, device: Any) -> None:
         write(device, voltage / loop.amplifier_gain, clock.edge[0])
 
 
-def sample(loop: Loop, status: int, reading: np.ndarray, share: float) -> float:
+def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int) -> float:
     """Return the voltage (V) that answers a reading, and take everything down."""
     number = loop.clock.number[0]
     references, log = loop.references, loop.log
@@ -169,6 +170,7 @@ def sample(loop: Loop, status: int, reading: np.ndarray, share: float) -> float:
     row = log.count[0] % len(log.number)
     log.number[row] = number
     log.instant[row] = loop.clock.edge[0]
+    log.late[row] = late
     log.reference[row] = reference
     log.deflection[row] = math.nan
     if status == FRESH:
@@ -188,13 +190,14 @@ def loop_with(driver: Driver) -> Callable[[Loop, Any], None]:
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive samples of the loop; `instant` (s of the monotonic clock), m and V.
+    """Consecutive samples of the loop; `instant` and `late` in s (monotonic clock), m and V.
 
     A deflection that did not come in time is NaN; a number that is left out was missed.
     """
 
     number: np.ndarray
     instant: np.ndarray
+    late: np.ndarray
     reference: np.ndarray
     deflection: np.ndarray
     command: np.ndarray
@@ -246,7 +249,7 @@ class Servo:
             references=References(np.full(ahead, 0.0), np.zeros(1, dtype=np.int64)),
             log=Log(
                 np.zeros(1, dtype=np.int64),
-                *(np.full(kept, 0, dtype=np.int64) for _ in range(2)),
+                *(np.full(kept, 0, dtype=np.int64) for _ in range(3)),
                 *(np.full(kept, 0.0) for _ in range(4)),
             ),
             amplifier_gain=parameters.amplifier_gain,
@@ -340,8 +343,8 @@ class Servo:
         self.lost += first - self._taken
         rows = np.arange(first, count) % len(log.number)
         self._taken = count
-        number, instant, *signals = (ring[rows] for ring in log[1:])
-        return Samples(number, instant * 1e-9, *signals)
+        number, instant, late, *signals = (ring[rows] for ring in log[1:])
+        return Samples(number, instant * 1e-9, late * 1e-9, *signals)
 
     @property
     def phase(self) -> int:
