@@ -106,7 +106,7 @@ class Feedforward:
     def __init__(self, parameters: FeedforwardParameters, sample_time: float) -> None:
         operator = coefficients(parameters.hysteresis, sample_time)
         self.coefficients = FeedforwardCoefficients(
-            inverting=parameters.compensator == "inverse",
+            inverting=parameters.compensator != "static_gain",
             static_gain=parameters.static_gain,
             low=parameters.voltage_low,
             high=parameters.voltage_high,

@@ -18,6 +18,10 @@ whatever the temperature does, memory stays right and the voltage has no bump. S
 part within the sample, so for a finger that is its model nothing is left but the vibration that shaping
 leaves. Where a limit acts, the models follow the voltage applied.
 
+While a controller leads the finger, its commands go through the inverse hysteresis of the same plays, and
+creep and heat follow. From one to the other the voltage has no bump: what models and controller disagree on
+at that moment is added to the input from then on.
+
 Source: M. Rakotondrabe, C. Clévy, P. Lutz, *Complete open loop control of hysteretic, creeped, and
 oscillating piezoelectric cantilevers*, IEEE T-ASE 7 (2010) 440, for the structure; the inverse that follows
 the temperature is solved play by play as in :mod:`piezo_control.hysteresis`.
@@ -104,9 +108,8 @@ class SensorlessState(NamedTuple):
     relaxations: list[float]  # m
     body: Body
     past: list[float]  # references (m), newest first
-    offset: list[float]  # m, added to the reference since a hand-over
+    offset: list[float]  # m, added to the input since a hand-over
     clipped: list[float]  # number of samples at which a limit acted
-    blind: list[float]  # number of samples without a temperature
 
 
 def sensorless_coefficients(
@@ -144,7 +147,7 @@ def sensorless_coefficients(
         operator=operator,
         creep=creep.discretize(p.creep.gain, p.creep.gain_per_degc, times, shares, sample_time),
         thermal=thermal.discretize(p.thermal, slopes[-1], sample_time),
-        taps=shaping.shaper(p.shaping, p.dynamics.denominator, sample_time),
+        taps=list(shaping.shaper(p.shaping, p.dynamics.denominator, sample_time)),
         low=p.voltage_low,
         high=p.voltage_high,
         step_limit=p.slew_limit * sample_time,
@@ -163,17 +166,23 @@ def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> Senso
         past=[0.0] * len(c.taps),
         offset=[0.0],
         clipped=[0.0],
-        blind=[0.0],
     )
 
 
+# Step functions: plain scalars and indexables, so that numba can compile them as they are.
+
+
 def sensorless_step(
-    c: SensorlessCoefficients, s: SensorlessState, reference: float, temperature_degc: float
+    c: SensorlessCoefficients,
+    s: SensorlessState,
+    reference: float,
+    temperature_degc: float,
+    share: float,
 ) -> float:
     """Return the voltage (V) for the reference (m) of this sample at a surface temperature (°C).
 
-    A temperature that is NaN is one that is missing: the body keeps the temperature it has, and `blind`
-    counts the sample.
+    `share` is the part of a sample time that has passed since the last one, for the slew limit. A temperature
+    that is NaN is one that is missing: the body keeps the temperature it has.
     """
     wanted = shape(c.taps, s.past, reference) + s.offset[0]
     warmth = s.body.degc[0] - REFERENCE_DEGC
@@ -193,7 +202,34 @@ def sensorless_step(
         stroke * (1.0 + softening),
         released - stroke * softening * c.thermal.slope,
     )
-    voltage = limited(c.low, c.high, c.step_limit, s.hysteresis.voltage[0], ideal)
+    return apply(c, s, ideal, warmth, share)
+
+
+def inverse_step(
+    c: SensorlessCoefficients,
+    s: SensorlessState,
+    command: float,
+    temperature_degc: float,
+    share: float,
+) -> float:
+    """Return the voltage (V) for a controller's command (m): the inverse hysteresis; the models follow."""
+    warmth = s.body.degc[0] - REFERENCE_DEGC
+    heat(c, s, temperature_degc)
+    ideal = operator_inverse(c.operator, s.hysteresis, command + s.offset[0], 1.0, 0.0)
+    return apply(c, s, ideal, warmth, share)
+
+
+def heat(c: SensorlessCoefficients, s: SensorlessState, temperature_degc: float) -> None:
+    """Let the body follow the surface by one sample, or keep its temperature where there is none."""
+    if temperature_degc == temperature_degc:  # not NaN
+        warm(c.thermal, s.body, min(max(temperature_degc, c.coldest), c.warmest))
+
+
+def apply(
+    c: SensorlessCoefficients, s: SensorlessState, ideal: float, warmth: float, share: float
+) -> float:
+    """Return the voltage (V) that the limits allow; hysteresis and creep follow it."""
+    voltage = limited(c.low, c.high, c.step_limit * share, s.hysteresis.voltage[0], ideal)
     if voltage != ideal:
         s.clipped[0] += 1.0
     operator_step(c.operator, s.hysteresis, voltage)
@@ -201,12 +237,7 @@ def sensorless_step(
     return voltage
 
 
-def heat(c: SensorlessCoefficients, s: SensorlessState, temperature_degc: float) -> None:
-    """Let the body follow the surface by one sample, or keep its temperature where there is none."""
-    if temperature_degc == temperature_degc:  # not NaN
-        warm(c.thermal, s.body, min(max(temperature_degc, c.coldest), c.warmest))
-    else:
-        s.blind[0] += 1.0
+FROM_REST, BY_REFERENCE, BY_CONTROLLER = range(3)
 
 
 class Sensorless:
@@ -226,23 +257,44 @@ class Sensorless:
         self.delay = shaping.delay(self.coefficients.taps, sample_time)
         self.state = sensorless_rest(self.coefficients, temperature_degc)
         self.predicted = 0.0
+        """Static deflection (m) that the models expect at the end of the last sample."""
+        self._led = FROM_REST
 
-    def step(self, reference: float, temperature_degc: float) -> float:
+    def step(self, reference: float, temperature_degc: float, share: float = 1.0) -> float:
         """Return the voltage (V) for the reference (m) of this sample; NaN is a missing temperature.
 
-        Raises ValueError when the reference is not finite or the temperature infinite; nothing changes.
+        After a controller's commands it goes on from the deflection that the models expect. `share` (0 to
+        1) is the part of a sample time that has passed since the last sample. Raises ValueError when the
+        reference is not finite or the temperature infinite; nothing changes.
         """
-        if not math.isfinite(reference) or math.isinf(temperature_degc):
-            raise ValueError(
-                f"reference is {reference!r} m, temperature is {temperature_degc!r} °C; must be finite"
-            )
-        warmth = self.state.body.degc[0] - REFERENCE_DEGC
-        voltage = sensorless_step(self.coefficients, self.state, reference, temperature_degc)
+        self._check("reference", reference, temperature_degc)
+        s = self.state
+        if self._led == BY_CONTROLLER:
+            s.past[:] = [reference] * len(s.past)
+            s.offset[0] = self.predicted - reference
+        self._led = BY_REFERENCE
+        warmth = s.body.degc[0] - REFERENCE_DEGC
+        voltage = sensorless_step(self.coefficients, s, reference, temperature_degc, share)
         self._predict(voltage, warmth)
         return voltage
 
-    def follow(self, voltage: float, temperature_degc: float) -> None:
-        """Take note of a sample whose `voltage` (V) another law chose: feedback, a ramp to rest."""
+    def lead(self, command: float, temperature_degc: float, share: float = 1.0) -> float:
+        """Return the voltage (V) for the command (m) of a controller, through the inverse hysteresis.
+
+        After references of :meth:`step` it goes on from the voltage that is applied. Otherwise as there.
+        """
+        self._check("command", command, temperature_degc)
+        s = self.state
+        if self._led == BY_REFERENCE:
+            s.offset[0] = self._static() - command
+        self._led = BY_CONTROLLER
+        warmth = s.body.degc[0] - REFERENCE_DEGC
+        voltage = inverse_step(self.coefficients, s, command, temperature_degc, share)
+        self._predict(voltage, warmth)
+        return voltage
+
+    def follow(self, voltage: float, temperature_degc: float = math.nan) -> None:
+        """Take note of a sample whose `voltage` (V) somebody else chose: a ramp to rest, a servo."""
         c, s = self.coefficients, self.state
         warmth = s.body.degc[0] - REFERENCE_DEGC
         heat(c, s, temperature_degc)
@@ -250,18 +302,48 @@ class Sensorless:
         creep_step(c.creep, s.relaxations, voltage, warmth)
         self._predict(voltage, warmth)
 
-    def take_over(self, reference: float) -> None:
-        """Go on from here at `reference` (m) without a bump.
+    def pause(self, samples: int) -> None:
+        """Let creep go on for `samples` that nobody asked for, with voltage and temperature held."""
+        c, s = self.coefficients, self.state
+        warmth = s.body.degc[0] - REFERENCE_DEGC
+        drive = max(0.0, c.creep.gain + c.creep.gain_per_degc * warmth) * self.voltage
+        for i, retained in enumerate(c.creep.retained):
+            final = c.creep.released[i] / (1.0 - retained) * drive
+            s.relaxations[i] = final + retained**samples * (s.relaxations[i] - final)
+        self._predict(self.voltage, warmth)
 
-        What the models are wrong by at this moment is added to the reference from now on.
-        """
-        self.state.past[:] = [reference] * len(self.state.past)
-        self.state.offset[0] = self.predicted - reference
+    def settle(self, temperature_degc: float) -> None:
+        """Learn the temperature that the finger has been in equilibrium with since its start."""
+        c, body = self.coefficients, self.state.body
+        body.degc[0] = body.degc_at_start[0] = min(max(temperature_degc, c.coldest), c.warmest)
+
+    @property
+    def body_degc(self) -> float:
+        """Temperature (°C) of the body."""
+        return self.state.body.degc[0]
+
+    @property
+    def voltage(self) -> float:
+        """The last voltage (V)."""
+        return self.state.hysteresis.voltage[0]
+
+    @property
+    def clipped(self) -> int:
+        """Number of samples at which the voltage or slew limit acted."""
+        return int(self.state.clipped[0])
+
+    def _check(self, name: str, value: float, temperature_degc: float) -> None:
+        if not math.isfinite(value) or math.isinf(temperature_degc):
+            raise ValueError(
+                f"{name} is {value!r} m, temperature is {temperature_degc!r} °C; must be finite"
+            )
+
+    def _static(self) -> float:
+        """Return the deflection (m) of the hysteresis at 22 °C."""
+        c, plays = self.coefficients.operator, self.state.hysteresis.plays
+        return sum(weight * play for weight, play in zip(c.weights, plays, strict=True))
 
     def _predict(self, voltage: float, warmth: float) -> None:
-        """Take down the static deflection (m) that the models expect at the end of the sample."""
         c, s = self.coefficients, self.state
-        plays = zip(c.operator.weights, s.hysteresis.plays, strict=True)
-        static = sum(weight * play for weight, play in plays)
         drift = thermal_deflection(c.thermal, s.body) + sum(s.relaxations)
-        self.predicted = heated(c.thermal, static, voltage, warmth) + drift
+        self.predicted = heated(c.thermal, self._static(), voltage, warmth) + drift

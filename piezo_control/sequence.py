@@ -7,7 +7,17 @@ Number 0 begins a run. Anything else is stray: it is not answered, and the count
 
 from __future__ import annotations
 
+from typing import Any
+
 NEW, REPEATED, FIRST, STRAY = range(4)
+
+
+def grid_index(sample: Any, sample_time: float, period: float) -> Any:
+    """Return which grid value holds at sample * sample_time; exact, in whole nanoseconds.
+
+    `sample` is a number or an integer array; the result is alike.
+    """
+    return sample * round(sample_time * 1e9) // round(period * 1e9)
 
 
 class Sequence:

@@ -25,6 +25,7 @@ P. Lutz, IEEE T-ASE 7 (2010) 440 (on piezocantilevers).
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -65,9 +66,10 @@ class ShapingParameters:
     )  # fmt: skip
 
 
+@functools.lru_cache(maxsize=16)
 def shaper(
-    parameters: ShapingParameters, denominator: Sequence[float], sample_time: float
-) -> list[float]:
+    parameters: ShapingParameters, denominator: tuple[float, ...], sample_time: float
+) -> tuple[float, ...]:
     """Return the taps a_j for the mode 1 / (a2 s² + a1 s + 1) and a sample time (s).
 
     Raises
@@ -80,16 +82,16 @@ def shaper(
     frequency = 1.0 / (2.0 * math.pi * math.sqrt(a2))
     damping = 0.5 * a1 / math.sqrt(a2)
     if parameters.kind == "none":
-        return [1.0]
+        return (1.0,)
     if damping >= 1.0 or frequency * (1.0 + parameters.spread) >= 0.5 / sample_time:
         raise ParameterError(
             f"'denominator' has its mode at {frequency:g} Hz with damping ratio {damping:g}: must vibrate "
             f"below {0.5 / sample_time:g} Hz, half the sampling rate, to be shaped"
         )
     if parameters.kind == "least_time":
-        return _least_time(parameters, frequency, damping, sample_time)
+        return tuple(_least_time(parameters, frequency, damping, sample_time))
     taps = _zero_vibration(frequency, damping, sample_time)
-    return (np.convolve(taps, taps) if parameters.kind == "robust" else taps).tolist()
+    return tuple((np.convolve(taps, taps) if parameters.kind == "robust" else taps).tolist())
 
 
 def residual_vibration(

@@ -45,6 +45,7 @@ from piezo_control.sensorless import (
     sensorless_rest,
     sensorless_step,
 )
+from piezo_control.sequence import grid_index
 from piezo_sim.plant import cantilever
 from piezo_sim.plant.cantilever import (
     CantileverModel,
@@ -55,7 +56,7 @@ from piezo_sim.plant.cantilever import (
     deviating,
     look,
 )
-from piezo_sim.temperature import TemperatureParameters, grid_index, temperature
+from piezo_sim.temperature import TemperatureParameters, temperature
 
 AT_ONCE = 1 << 16
 """Samples whose random draws are made together; the signals do not depend on it."""
@@ -420,7 +421,9 @@ def run_sensorless_samples(
     for n in range(len(inputs.reference)):
         look(plant, state, inputs.normal[n], inputs.uniform[n])
         reference = inputs.reference[n]
-        voltage = sensorless_step(finger.law, finger.law_state, reference, inputs.temperature[n])
+        voltage = sensorless_step(
+            finger.law, finger.law_state, reference, inputs.temperature[n], 1.0
+        )
         if (first + n) % every == 0:
             row = (first + n) // every
             outputs.deflection[row] = state.readings[0]

@@ -16,7 +16,6 @@ import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -92,14 +91,6 @@ def temperature(parameters: TemperatureParameters, first: int, count: int) -> np
             raise ParameterError(f"{p.file}: cannot be read: {error}") from None
         return np.interp(time, *_recording(p.file, p.topic, changed))
     return p.base_degc + p.amplitude_degc * _shape(p, time - p.start)
-
-
-def grid_index(sample: Any, sample_time: float, period: float) -> Any:
-    """Return which grid value holds at sample * sample_time; exact, in whole nanoseconds.
-
-    `sample` is a number or an integer array; the result is alike.
-    """
-    return sample * round(sample_time * 1e9) // round(period * 1e9)
 
 
 def _shape(p: TemperatureParameters, time: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEVELS = [
     {"parameters", "profile", "metrics", "safety", "sequence", "shared", "compiled", "start"},
     {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
-    {"shaping", "feedforward", "sensorless", "design"},
+    {"shaping", "feedforward", "sensorless", "thermometer", "design"},
     {"identification", "servo"},
     {"nodes"},
     {"plant", "temperature"},

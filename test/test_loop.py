@@ -18,8 +18,8 @@ from rosbags.highlevel import AnyReader
 
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import read
-from piezo_sim import engine
 from piezo_sim.experiment.cases import NODES, Case
+from piezo_sim.experiment.on_engine import run_on_engine
 from piezo_sim.experiment.on_nodes.processes import NodeDied
 from piezo_sim.experiment.on_nodes.runner import run_cases
 
@@ -62,6 +62,7 @@ def twin_runs(tmp_path_factory):
     out = tmp_path_factory.mktemp("twins")
     with Progress(disable=True) as progress:
         cases = [closed_loop("first"), closed_loop("second")]
+        cases.append(replace(cases[0], name="sensorless", mode="sensorless", controller="none"))
         return list(run_cases(cases, out, "twins", progress))
 
 
@@ -71,7 +72,7 @@ def serialized(bag: Path, name: str) -> list[tuple[int, bytes]]:
 
 
 def test_two_runs_of_one_seed_are_byte_equal(twin_runs):
-    first, second = (run.bag for run in twin_runs)
+    first, second, _ = (run.bag for run in twin_runs)
     for topic in (*LOOP, "temperature"):
         samples = serialized(first, topic)
         assert samples == serialized(second, topic)
@@ -94,25 +95,17 @@ def test_bag_has_every_sample_once_for_another_mcap_reader(twin_runs):
         assert numbers[topic] == list(range(SAMPLES)), topic
 
 
-def test_nodes_over_topics_give_the_samples_of_the_engine(twin_runs):
-    run = twin_runs[0]
-    parameters = run.case.parameters()
-    expected = engine.run(
-        parameters["cantilever"],
-        parameters["feedforward"],
-        parameters["feedback"],
-        parameters["temperature"],
-        run.case.reference,
-        SAMPLES,
-        run.case.tip_force,
-    )
-    got = read(run.bag)
-    np.testing.assert_allclose(got.time, expected.time, rtol=0, atol=1e-9)
-    for signal_name in ("reference", "deflection", "command", "voltage", "temperature"):
-        np.testing.assert_allclose(
-            getattr(got, signal_name), getattr(expected, signal_name), rtol=0, atol=1e-12,
-            err_msg=signal_name,
-        )  # fmt: skip
+def test_nodes_over_topics_give_the_samples_of_the_engine(twin_runs, tmp_path):
+    for run in (twin_runs[0], twin_runs[2]):
+        with Progress(disable=True) as progress:
+            expected = read(run_on_engine(run.case, tmp_path, "finger", progress).bag)
+        got = read(run.bag)
+        np.testing.assert_allclose(got.time, expected.time, rtol=0, atol=1e-9)
+        for signal_name in ("reference", "deflection", "command", "voltage", "temperature"):
+            np.testing.assert_allclose(
+                getattr(got, signal_name), getattr(expected, signal_name), rtol=0, atol=1e-12,
+                err_msg=f"{run.case.name}: {signal_name}",
+            )  # fmt: skip
 
 
 @pytest.mark.parametrize("victim", list(NODES))

@@ -99,7 +99,9 @@ def test_recorder_that_was_killed_leaves_a_readable_part(tmp_path):
 
 
 def sample(number: int, stamp: int, value: float) -> bytes:
-    return SAMPLE_CDR.pack(LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, value, 1e-4, False)
+    return SAMPLE_CDR.pack(
+        LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, value, 1e-4, False, False, False
+    )
 
 
 def test_no_bag_at_all(tmp_path):

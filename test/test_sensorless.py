@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piezo_control.creep import CreepParameters
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import Hysteresis, HysteresisParameters, operator_inverse
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
@@ -111,26 +112,52 @@ def test_limits_of_voltage_and_slew_hold_and_are_counted():
     assert law.state.clipped == [20.0]
 
 
-def test_a_missing_temperature_is_counted_and_the_last_one_goes_on():
+def test_without_a_temperature_the_last_one_goes_on():
     laws = [Sensorless(SensorlessParameters(), H, 30.0) for _ in range(2)]
     for _ in range(100):
         assert laws[0].step(5e-6, math.nan) == laws[1].step(5e-6, 30.0)
-    assert laws[0].state.blind == [100.0]
-    assert laws[1].state.blind == [0.0]
 
 
-def test_it_takes_over_in_mid_run_without_a_bump():
+def led_by_a_controller():
+    """A law whose models follow a controller that leads the finger around in the warmth."""
     law = Sensorless(SensorlessParameters(), H, 22.0)
     for k in range(1000):
-        law.follow(30.0 * math.sin(k / 200.0), 25.0)
-    before = law.state.hysteresis.voltage[0]
-    law.take_over(
-        reference=9e-6
-    )  # feedback said 9 µm; the models, not quite right, say something else
-    first = [law.step(9e-6, 25.0) for _ in range(100)]
-    # Only heat and creep of 10 ms move it.
-    assert np.max(np.abs(np.array(first) - before)) < 0.2
-    assert law.state.clipped == [0.0]
+        law.lead(15e-6 * math.sin(k / 200.0), 32.0)
+    return law
+
+
+def test_a_controller_is_led_through_the_inverse_hysteresis():
+    law = led_by_a_controller()
+    inverse = Feedforward(FeedforwardParameters(), H)
+    for k in range(1000):
+        voltage = inverse.step(15e-6 * math.sin(k / 200.0))
+    assert law.voltage == pytest.approx(voltage, abs=1e-11)
+
+
+def test_the_sensor_is_taken_away_in_mid_run_and_given_back_without_a_bump():
+    law = led_by_a_controller()
+    before = law.voltage
+    # Feedback said 9 µm; the models, not quite right, say something else.
+    alone = np.array([before, *(law.step(9e-6, 32.0) for _ in range(100))])
+    # Only heat and creep move it, by less than 1 mV a sample.
+    assert np.max(np.abs(np.diff(alone))) < 1e-3
+    command = 7e-6
+    assert law.lead(command, 32.0) == pytest.approx(alone[-1], abs=1e-9)
+    assert law.lead(command + 1e-6, 32.0) > alone[-1] + 1.0
+    assert law.clipped == 0
+
+
+@pytest.mark.parametrize("samples", [1, 1000])
+def test_a_pause_is_what_as_many_samples_of_the_held_voltage_do(samples):
+    laws = [Sensorless(SensorlessParameters(), H, 32.0) for _ in range(2)]
+    for law in laws:
+        law.follow(30.0)
+        law.follow(20.0)
+    laws[0].pause(samples)
+    for _ in range(samples):
+        laws[1].follow(20.0)
+    assert laws[0].predicted == pytest.approx(laws[1].predicted, abs=1e-18)
+    assert laws[0].state.relaxations == pytest.approx(laws[1].state.relaxations, rel=1e-9)
 
 
 def test_it_is_the_same_law_compiled():

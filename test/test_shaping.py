@@ -86,5 +86,5 @@ def test_what_cannot_be_shaped_is_refused(monkeypatch):
     with pytest.raises(ParameterError, match="half the sampling rate"):
         shaper(ShapingParameters(), DENOMINATOR, 1e-3)
     monkeypatch.setattr(shaping, "LONGEST", 10)
-    with pytest.raises(ParameterError, match="'residual' is 0.05: no shaper up to 10 samples"):
-        shaper(ShapingParameters(), DENOMINATOR, H)
+    with pytest.raises(ParameterError, match="'residual' is 0.04: no shaper up to 10 samples"):
+        shaper(ShapingParameters(residual=0.04), DENOMINATOR, H)

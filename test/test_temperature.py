@@ -13,7 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.integrate import solve_ivp
 
 from piezo_control.parameters import ParameterError
-from piezo_sim.temperature import PROFILES, TemperatureParameters, grid_index, temperature
+from piezo_control.sequence import grid_index
+from piezo_sim.temperature import PROFILES, TemperatureParameters, temperature
 
 
 def values(count=20000, first=0, **changes):

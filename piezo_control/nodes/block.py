@@ -68,13 +68,9 @@ class BlockNode(FingerNode):
         """Take up a new run, before its first sample."""
         raise NotImplementedError
 
-    def compute(self, number: int, value: float) -> float | None:
-        """Return the answer to sample `number`, None when there is none yet."""
+    def compute(self, sample: Sample, answer: Sample) -> bool:
+        """Write the answer to a sample, or say that there is none."""
         raise NotImplementedError
-
-    def limited(self) -> bool:
-        """Say whether a limit acted on the last answer."""
-        return False
 
     def trip(self, cause: str) -> None:
         """Latch a fault."""
@@ -169,11 +165,7 @@ class BlockNode(FingerNode):
         if kind == FIRST and lockstep and self.sequence.next != 0:
             self.restart()
         self.sequence.count(number)
-        value = self.compute(number, sample.value)
-        if value is None:
-            return
         answer = Sample(header=sample.header, number=number, period=self.parameters.sample_time)
-        answer.value = value
-        answer.limited = self.limited()
-        self.answers.publish(answer)
-        self.last = answer
+        if self.compute(sample, answer):
+            self.answers.publish(answer)
+            self.last = answer

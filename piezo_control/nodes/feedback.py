@@ -27,6 +27,7 @@ from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.parameters import ParameterError, build, flatten, load
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch
 from piezo_control.shared import shared_folder
+from piezo_gripper_msgs.msg import Sample
 
 # What makes a controller; its limits of the command may change by themselves.
 DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high"}
@@ -156,11 +157,13 @@ class FeedbackNode(BlockNode):
         p = self.parameters
         return wrong, {**figures, "controller": p.name, "certified": p.certified}
 
-    def compute(self, number: int, value: float) -> float | None:
-        self.deflection = value
+    def compute(self, sample: Sample, answer: Sample) -> bool:
+        self.deflection = sample.value
         if self.parameters.mode == "free_running" and not self._is_in_time():
-            return None
-        return self.law.step(self.reference[number], value)
+            return False
+        answer.value = self.law.step(self.reference[sample.number], sample.value)
+        answer.by_controller = self.parameters.controller != "none"
+        return True
 
     def _is_in_time(self) -> bool:
         """Say whether the loop keeps its sample time; a loop that did and no longer does is at fault."""

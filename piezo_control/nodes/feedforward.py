@@ -1,30 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
 """The block H_s⁻¹ of the paper's loop: from the commanded deflection to the voltage.
 
-in:  command (Sample, m), state (FingerState: the voltage that is applied when this node starts)
+in:  command (Sample, m), state (FingerState: the voltage that is applied when this node starts),
+     temperature (sensor_msgs/Temperature, °C) with `compensator: sensorless`
 out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator
 
 Running free, a command that stays away is held and then ramped to rest, the voltage nearest to 0 V, where
 it stays until `~/reset`. When the node is deactivated, shut down or stopped by a signal, the voltage ramps to
 rest too, in either mode. A restart goes on from the voltage that is applied.
+
+With `compensator: sensorless` a command that is the reference itself goes through the models of hysteresis,
+vibration, creep and heat; a controller's command goes through the inverse hysteresis, and the models follow.
+So a `feedback` that is told `controller: none` in mid-run leaves a finger that goes on without a bump. A
+temperature that is missing or frozen is named in `state`, on `/diagnostics` and in the log, until it is back.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import Temperature
+
 from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
-from piezo_control.nodes.block import BlockNode
+from piezo_control.nodes.block import BlockNode, seconds
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
+from piezo_control.nodes.qos import SAMPLE
 from piezo_control.safety import (
     FAULT,
+    HIGHEST_DEGC,
     LARGEST_DEFLECTION,
+    LOWEST_DEGC,
     RAMP_PERIOD,
     RAMPING,
     limits,
 )
+from piezo_control.sensorless import Sensorless
+from piezo_control.sequence import grid_index
+from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import Sample
 
 
@@ -39,7 +55,11 @@ class FeedforwardNode(BlockNode):
         super().__init__()
         self.watchdog = self.create_steady_timer(RAMP_PERIOD, self._watch, autostart=False)
         self.moved = time.monotonic()
-        self._clipped = 0
+        self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
+        self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
+        self._waiting: Sample | None = None  # for its temperature
+        self._subscription: Subscription | None = None
+        self._said = ""
         self._build(0.0)
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
@@ -56,6 +76,13 @@ class FeedforwardNode(BlockNode):
         elif self.built_with != self.parameters:
             self._build(self.law.voltage)
         self.moved = time.monotonic()
+        self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
+        self._temperatures.clear()
+        self._waiting = None
+        if self.parameters.compensator == "sensorless":
+            self._subscription = self.create_subscription(
+                Temperature, "temperature", self._on_temperature, SAMPLE
+            )
         if self.parameters.mode == "free_running":
             self.watchdog.reset()
 
@@ -65,27 +92,112 @@ class FeedforwardNode(BlockNode):
 
     def _build(self, voltage: float) -> None:
         """Make a new law of a homed finger that was led to `voltage` (V)."""
-        self.built_with = self.parameters
-        self.law = Feedforward(self.parameters, self.parameters.sample_time)
+        p = self.built_with = self.parameters
+        self.law: Feedforward | Sensorless
+        if p.compensator == "sensorless":
+            degc = self.thermometer.degc
+            self._settled = not math.isnan(degc)
+            start = degc if self._settled else p.thermometer.degc_at_start
+            self.law = Sensorless(p, p.sample_time, start)
+        else:
+            self.law = Feedforward(p, p.sample_time)
         if voltage != self.law.voltage:
             self.law.follow(voltage)
 
-    def compute(self, number: int, value: float) -> float:
-        now = time.monotonic()
-        share = 1.0
-        if self.parameters.mode == "free_running":
-            share = min(1.0, (now - self.moved) / self.parameters.sample_time)
-        self.moved = now
-        self.guard.hear(now)
-        self._clipped = self.law.clipped
-        return self.law.step(value, share)
+    # --- temperature --------------------------------------------------------------------------------
 
-    def limited(self) -> bool:
-        return self.law.clipped > self._clipped
+    def _on_temperature(self, message: Temperature) -> None:
+        degc = message.temperature
+        if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
+            self.get_logger().error(
+                f"'temperature' is {degc} °C, must be within [{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C; ignored",
+                throttle_duration_sec=1.0,
+            )
+        elif not self._is_on_grid():
+            self.thermometer.hear(degc, time.monotonic())
+        else:
+            place = round(seconds(message.header.stamp) / self.parameters.temperature_period)
+            if self._temperatures and place <= max(self._temperatures):
+                self._temperatures.clear()  # a new run, or once more from the present instant on
+            self._temperatures[place] = degc
+            if self._waiting:
+                self._on_sample(self._waiting)
+
+    def _is_on_grid(self) -> bool:
+        p = self.parameters
+        return p.temperature_lockstep and p.mode == "lockstep"
+
+    def _on_sample(self, sample: Sample) -> None:
+        """Let a sample in lock-step wait for its temperature."""
+        p, number = self.parameters, sample.number
+        is_new = number == 0 or number >= self.sequence.next
+        if self.active and self._subscription and self._is_on_grid() and is_new:
+            place = grid_index(number, p.sample_time, p.temperature_period)
+            if place not in self._temperatures:
+                self._waiting = sample
+                return
+            self._waiting = None
+            if number == 0:
+                self.thermometer = Thermometer(p.thermometer, 0.0)
+            self.thermometer.hear(self._temperatures[place], number * p.sample_time)
+            self._temperatures = {n: t for n, t in self._temperatures.items() if n >= place}
+        super()._on_sample(sample)
+
+    def _read(self, law: Sensorless, now: float) -> float:
+        """Return the temperature (°C), NaN for one that cannot be believed, and say so once."""
+        degc = self.thermometer.read(now)
+        if not self._settled and not math.isnan(degc):
+            law.settle(degc)
+            self._settled = True
+        if self.thermometer.wrong != self._said:
+            self._said = self.thermometer.wrong
+            if not self._said:
+                self.get_logger().info(f"temperature is back: {degc:g} °C")
+            elif self.parameters.thermometer.fallback == "fault":
+                self.trip(self._said)
+            else:
+                self.get_logger().error(f"{self._said}; the models go on with {law.body_degc:g} °C")
+            self.publish_diagnostics()
+        return degc
+
+    # --- samples ------------------------------------------------------------------------------------
+
+    def compute(self, sample: Sample, answer: Sample) -> bool:
+        p = self.parameters
+        now = time.monotonic()
+        is_free = p.mode == "free_running"
+        share = min(1.0, (now - self.moved) / p.sample_time) if is_free else 1.0
+        self.guard.hear(now)
+        clipped = self.law.clipped
+        if isinstance(self.law, Sensorless):
+            instant = sample.number * p.sample_time if self._is_on_grid() else now
+            degc = self._read(self.law, instant)
+            if self.guard.is_latched:
+                return False
+            answer.without_temperature = bool(self.thermometer.wrong)
+            if is_free and sample.number > self.last.number + 1:
+                self.law.pause(sample.number - self.last.number - 1)
+            answer_to = self.law.lead if sample.by_controller else self.law.step
+            answer.value = answer_to(sample.value, degc, share)
+        else:
+            answer.value = self.law.step(sample.value, share)
+        self.moved = now
+        answer.limited = self.law.clipped > clipped
+        return True
 
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()
-        return wrong, {**figures, "voltage": self.law.voltage, "clipped": self.law.clipped}
+        figures |= {"voltage": self.law.voltage, "clipped": self.law.clipped}
+        if isinstance(self.law, Sensorless):
+            figures |= {
+                "temperature": self.thermometer.degc,
+                "body temperature": self.law.body_degc,
+                "expected deflection": self.law.predicted,
+            }
+            wrong = wrong or self.thermometer.wrong
+            if self._waiting:
+                wrong = wrong or f"sample {self._waiting.number} waits for its temperature"
+        return wrong, figures
 
     def reset(self) -> None:
         super().reset()
@@ -96,6 +208,9 @@ class FeedforwardNode(BlockNode):
         self.watchdog.reset()  # in lock-step too: the voltage goes to rest
 
     def stop(self) -> None:
+        if self._subscription:
+            self.destroy_subscription(self._subscription)
+            self._subscription = None
         self.watchdog.cancel()
         self.guard.trip("stopped", time.monotonic())
         while self.guard.phase == RAMPING:

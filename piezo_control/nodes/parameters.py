@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import parameter
+from piezo_control.parameters import group, parameter
 from piezo_control.safety import SafetyParameters
+from piezo_control.sensorless import SensorlessParameters
 from piezo_control.servo.parameters import ServoParameters
+from piezo_control.thermometer import ThermometerParameters
 
 MODES = ("lockstep", "free_running")
 
@@ -39,12 +41,27 @@ class LoopParameters:
 
 
 @dataclass(frozen=True)
-class FeedforwardNodeParameters(FeedforwardParameters, LoopParameters, SafetyParameters):
-    """The law's parameters and the node's own."""
+class FeedforwardNodeParameters(
+    FeedforwardParameters, SensorlessParameters, LoopParameters, SafetyParameters
+):
+    """The laws' parameters and the node's own."""
 
+    compensator: str = parameter(
+        "inverse",
+        "inverse: analytic inverse of the hysteresis; static_gain: command / static_gain; sensorless: where "
+        "no controller is in between, by the models of hysteresis, vibration, creep and heat, else inverse",
+        choices=("inverse", "static_gain", "sensorless"),
+    )
     sample_time: float = parameter(
         1e-4, "time from command to command, for the slew limit", unit="s", low=1e-6, high=1.0
     )
+    temperature_lockstep: bool = parameter(
+        False, "sensorless in lock-step: each sample waits for its temperature, on a grid"
+    )
+    temperature_period: float = parameter(
+        1e-3, "grid of these temperatures", unit="s", low=1e-6, high=10.0
+    )
+    thermometer: ThermometerParameters = group(ThermometerParameters)
 
 
 @dataclass(frozen=True)

@@ -178,10 +178,11 @@ class RecorderNode(FingerNode):
             stamp = seconds * 10**9 + nanoseconds
             if track.is_numbered or track.is_block:
                 self._tell_time(max(stamp, self.newest, 1))
-            elif not stamp and not self.newest:
-                self.unstamped.append((topic, data))  # until a sample says what time it is
-                return
-            stamp = stamp or self.newest
+            elif not stamp and not track.is_stamped:  # a temperature's 0 is the instant of sample 0
+                if not self.newest:
+                    self.unstamped.append((topic, data))  # until a sample says what time it is
+                    return
+                stamp = self.newest
         else:
             stamp = self.get_clock().now().nanoseconds
         if track.is_numbered and not self._is_new(track, sample_number(data)):

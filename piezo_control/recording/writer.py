@@ -31,8 +31,8 @@ from piezo_control.recording.recording import (
 )
 from piezo_control.shared import shared_folder
 
-# Encapsulation, stamp, empty frame_id, number, value, period, limited.
-SAMPLE_CDR = struct.Struct("<4s i I I 4x Q d d ?")
+# Encapsulation, stamp, empty frame_id, number, value, period, and the three that are true or false.
+SAMPLE_CDR = struct.Struct("<4s i I I 4x Q d d ? ? ?")
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
@@ -135,7 +135,15 @@ def write_recording(
             bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
         for topic, values in signals:
             data = SAMPLE_CDR.pack(
-                LITTLE_ENDIAN, *divmod(stamp, 10**9), 1, number, values[k], period, False
+                LITTLE_ENDIAN,
+                *divmod(stamp, 10**9),
+                1,
+                number,
+                values[k],
+                period,
+                False,
+                False,
+                False,
             )
             bag.write(topic, stamp, data)
     bag.close()

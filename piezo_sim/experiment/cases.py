@@ -35,7 +35,13 @@ NODES = {
 }
 """Node name to parameters, in the order of activation: the master of time last."""
 
-MODES = ("open_loop", "feedforward", "feedback")
+COMPENSATORS = {
+    "open_loop": "static_gain",
+    "feedforward": "inverse",
+    "sensorless": "sensorless",
+    "feedback": "inverse",
+}
+"""Mode of a case to compensator of its feedforward."""
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
 EXPERIMENT_KEYS = {
     "title": "heading of the report",
@@ -54,7 +60,7 @@ RUN_KEYS = {
     "analysis": "how its recording is analysed; the experiment's name if left out",
     "duration": "length (s)",
     "every": "on the engine: every so many samples are recorded",
-    "mode": "open_loop, feedforward or feedback; one, or a list",
+    "mode": "open_loop, feedforward, sensorless or feedback; one, or a list",
     "reference": "profile of the reference: shape, amplitude_um, …",
     "voltage": "profile of the voltage instead, in open loop: shape, amplitude_v, …",
     "tip_force": "profile of a force on the tip: shape, amplitude_mn, …",
@@ -101,7 +107,9 @@ class Case:
             "feedforward": {
                 "subscribers": 2,
                 "sample_time": self.sample_time,
-                "compensator": "static_gain" if self.mode == "open_loop" else "inverse",
+                "compensator": COMPENSATORS[self.mode],
+                "temperature_lockstep": self.mode == "sensorless",
+                "temperature_period": grid,
                 # Without feedback the paper's steps are as steep as the amplifier goes.
                 **(
                     {}
@@ -111,7 +119,7 @@ class Case:
             },
             "feedback": {"subscribers": 2},
             "temperature": {
-                "subscribers": 2,
+                "subscribers": 3 if self.mode == "sensorless" else 2,
                 "period": grid,
                 "ahead": 20 * grid,
                 **self.temperature,
@@ -256,8 +264,10 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
     modes, controllers = _listed(run["mode"]), _listed(run.get("controller", "none"))
     cases = []
     for mode, controller, degc in itertools.product(modes, controllers, temperatures):
-        if mode not in MODES:
-            raise ParameterError(f"{where}: mode is '{mode}', must be one of {MODES}")
+        if mode not in COMPENSATORS:
+            raise ParameterError(
+                f"{where}: mode is '{mode}', must be one of {', '.join(COMPENSATORS)}"
+            )
         if mode != "feedback":
             if controller != controllers[0]:
                 continue  # without feedback, one case stands for all controllers

@@ -19,16 +19,17 @@ def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> Cas
     task = progress.add_task(f"{case.name} (engine)", total=case.samples)
     parameters = case.parameters(bag)
     begin = time.monotonic()
-    made = engine.run(
-        parameters["cantilever"],
-        parameters["feedforward"],
-        parameters["feedback"],
-        parameters["temperature"],
-        case.reference,
-        case.samples,
-        case.tip_force,
-        every=case.every,
-    )
+    temperature, tip_force = parameters["temperature"], case.tip_force
+    plant, feedforward = parameters["cantilever"], parameters["feedforward"]
+    if case.mode == "sensorless":
+        made = engine.run_sensorless(
+            plant, feedforward, temperature, case.reference, case.samples, tip_force, case.every
+        )
+    else:
+        made = engine.run(
+            plant, feedforward, parameters["feedback"], temperature, case.reference, case.samples,
+            tip_force, case.every,
+        )  # fmt: skip
     seconds = time.monotonic() - begin
     bag.parent.mkdir(parents=True, exist_ok=True)
     write_recording(bag, finger, made, case.reference, case.tip_force)

@@ -20,6 +20,7 @@ from piezo_sim.experiment.report import Section, cell
 MODE_TITLES = {
     "open_loop": "open loop (static gain)",
     "feedforward": "feedforward (inverse hysteresis)",
+    "sensorless": "feedforward (hysteresis, vibration, creep and heat)",
 }
 HEADINGS = {
     "transient": "Step of the voltage (Fig. 3)",

@@ -41,10 +41,10 @@ from piezo_control.safety import (
     is_physical,
     limits,
 )
+from piezo_control.sequence import grid_index
 from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_sim.nodes.parameters import CantileverNodeParameters
 from piezo_sim.plant.cantilever import Cantilever
-from piezo_sim.temperature import grid_index
 
 STATE_PERIOD = 0.1  # s
 JITTER_WINDOW = 1000  # periods: to sort more takes longer than a period
@@ -77,6 +77,7 @@ class CantileverNode(FingerNode):
         self.plant = Cantilever(p)
         self.guard = Guard(p.hold_time)
         self.limited = 0
+        self.without_temperature = False
         self.tip_force.restart(p.sample_time)
         self.number = 0
         self.asked_again = 0
@@ -188,9 +189,13 @@ class CantileverNode(FingerNode):
                     f"±{LARGEST_VOLTAGE:g} V"
                 )
             else:
-                self.limited += voltage.limited
-                self.pending_voltage = voltage.value
+                self._take(voltage)
                 self._advance()
+
+    def _take(self, voltage: Sample) -> None:
+        self.limited += voltage.limited
+        self.without_temperature = voltage.without_temperature
+        self.pending_voltage = voltage.value
 
     def _on_temperature(self, message: Temperature) -> None:
         if not LOWEST_DEGC <= message.temperature <= HIGHEST_DEGC:
@@ -274,8 +279,7 @@ class CantileverNode(FingerNode):
                 throttle_duration_sec=1.0,
             )
         else:
-            self.limited += voltage.limited
-            self.pending_voltage = voltage.value
+            self._take(voltage)
             self.guard.hear(now)
 
     def _tick(self) -> None:
@@ -354,6 +358,8 @@ class CantileverNode(FingerNode):
 
     def _publish_state(self) -> None:
         state = FingerState(phase=self.phase, samples=self.number, text=self.text)
+        if self.without_temperature and not self.text:
+            state.text = "'voltage' is by models whose temperature is missing or frozen"
         state.header.stamp = self.sample.header.stamp
         state.deflection = self.sample.value
         state.voltage = self.plant.voltage
