@@ -63,6 +63,7 @@ setup(
             "identify = piezo_control.start:identify",
             "synthesize = piezo_control.start:synthesize",
             "servo = piezo_control.start:servo",
+            "commission = piezo_control.start:commission",
             "udp_finger = piezo_sim.start:udp_finger",
             "gripper = piezo_control.start:gripper",
             "monte_carlo = piezo_sim.start:monte_carlo",

@@ -19,6 +19,7 @@ def executable(module: str) -> Callable[[], int]:
     return start
 
 
+commission = executable("piezo_control.servo.commission")
 feedback = executable("piezo_control.nodes.feedback")
 feedforward = executable("piezo_control.nodes.feedforward")
 gripper = executable("piezo_control.nodes.gripper")

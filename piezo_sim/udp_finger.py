@@ -46,6 +46,8 @@ class Line(NamedTuple):
     """The socket, one datagram as integers and as floats in the same memory, and who sent it."""
 
     socket: int
+    scale: float  # the sensor's: its unit per m, and its reading at 0 m
+    zero: float
     integers: np.ndarray
     floats: np.ndarray
     address: np.ndarray
@@ -100,7 +102,7 @@ def serve(
             seen.samples[0] += 1.0
             seen.lowest[0] = min(seen.lowest[0], voltage)
             seen.highest[0] = max(seen.highest[0], voltage)
-            line.floats[2] = device.reading[0]
+            line.floats[2] = line.zero + line.scale * device.reading[0]
             _sendto(
                 line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
                 line.length[0],
@@ -118,6 +120,8 @@ def serve(
 class UdpFinger:
     """The finger in a thread of its own, bound to a UDP port of an address.
 
+    Its sensor says ``zero + scale * deflection`` (`scale` per m).
+
     Raises OSError when the port cannot be had.
     """
 
@@ -128,6 +132,8 @@ class UdpFinger:
         port: int = 0,
         safety: SafetyParameters | None = None,
         priority: int = 0,
+        scale: float = 1.0,
+        zero: float = 0.0,
     ) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind((host, port))
@@ -137,7 +143,7 @@ class UdpFinger:
         safety = safety or SafetyParameters()
         datagram = np.zeros(3, dtype=np.int64)
         self._line = Line(
-            self._socket.fileno(), datagram, datagram.view(float), np.zeros(16, dtype=np.int64),
+            self._socket.fileno(), scale, zero, datagram, datagram.view(float), np.zeros(16, dtype=np.int64),
             np.zeros(1, dtype=np.uint32),
         )  # fmt: skip
         self._device = device_of(plant)
@@ -190,6 +196,10 @@ def main() -> int:
         default=0,
         help="of the real-time scheduler, 0: ordinary (%(default)s)",
     )
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="sensor: its unit per m (%(default)s)"
+    )
+    parser.add_argument("--zero", type=float, default=0.0, help="sensor: at 0 m (%(default)s)")
     arguments = parser.parse_args()
     stopped = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -199,7 +209,10 @@ def main() -> int:
         if arguments.cantilever:
             values = load(arguments.cantilever, "cantilever")
             plant = build(CantileverParameters, values, arguments.cantilever)
-        finger = UdpFinger(plant, arguments.host, arguments.port, priority=arguments.priority)
+        finger = UdpFinger(
+            plant, arguments.host, arguments.port, None, arguments.priority, arguments.scale,
+            arguments.zero,
+        )  # fmt: skip
     except (ParameterError, OSError, OverflowError) as error:
         print(f"udp_finger: {error}", file=sys.stderr)
         return 2

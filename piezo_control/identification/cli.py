@@ -26,7 +26,7 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import plots as plots
 from piezo_control.identification.drift import identify_drift
-from piezo_control.identification.dynamics import identify_dynamics
+from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics
 from piezo_control.identification.hysteresis import (
     FitQuality,
     HysteresisModel,
@@ -188,6 +188,7 @@ def finish_dynamics(
     found = {
         "natural_frequency_hz": model.natural_frequency / (2.0 * np.pi),
         "damping_ratio": model.damping_ratio,
+        "delay_samples": delay_of(model, arguments),
         "denominator": model.denominator,
     }
     change: dict[str, Any] = {"denominator": model.denominator}
@@ -202,11 +203,20 @@ def finish_dynamics(
     comment = (
         f"{name} identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke."
     )
+    if name != "stiffness":
+        update_cantilever(
+            arguments.out, comment, "sensor", {"delay_samples": delay_of(model, arguments)}
+        )
     return [
         update_cantilever(arguments.out, comment, "dynamics", change),
         picture,
         write_json(arguments.out / f"{name}.json", {**found, **figures(fit)}),
     ]
+
+
+def delay_of(model: DynamicsModel, arguments: argparse.Namespace) -> int:
+    """Return the age of a reading (samples): what was found, and what a bag was read with."""
+    return model.delay_samples + is_bag(arguments.recording) * arguments.sensor_delay
 
 
 def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:

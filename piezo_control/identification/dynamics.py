@@ -3,10 +3,10 @@
 
 The model's output is compared, not its equation, so noise does not bias the damping::
 
-    deflection = gain D(s) drive + offset + slope t
+    deflection = gain D(s) z^-delay drive + offset + slope t
 
-`drive` is held from sample to sample (exact zero-order hold); natural frequency and damping ratio are
-searched, the rest is linear least squares. With the tip force as drive the gain is the elastic
+`drive` is held from sample to sample (exact zero-order hold); natural frequency, damping ratio and a delay of
+whole samples are searched, the rest is linear least squares. With the tip force as drive the gain is the elastic
 constant s_p, with the hysteresis operator's output it should be 1.
 """
 
@@ -23,6 +23,7 @@ from scipy.signal import cont2discrete, lfilter
 from piezo_control.identification.measurement import Measurement, MeasurementError
 
 FREQUENCIES = 150  # tried before the search, from one cycle in the measurement to Nyquist
+LONGEST_DELAY = 8  # samples
 DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
 
 
@@ -35,6 +36,7 @@ class DynamicsModel:
     gain: float  # m per unit of the drive
     offset: float  # m
     slope: float  # m/s
+    delay_samples: int  # from the drive to the deflection, beyond how they are paired
 
     @property
     def denominator(self) -> tuple[float, float, float]:
@@ -46,7 +48,10 @@ class DynamicsModel:
         """Return the deflection (m) at evenly spaced `time` (s) from rest at drive[0]."""
         time = np.asarray(time, float)
         response = _respond(
-            self.natural_frequency, self.damping_ratio, np.asarray(drive, float), time[1] - time[0]
+            self.natural_frequency,
+            self.damping_ratio,
+            _delayed(np.asarray(drive, float), self.delay_samples),
+            time[1] - time[0],
         )
         return self.gain * response + self.offset + self.slope * (time - time[0])
 
@@ -60,8 +65,13 @@ def _respond(frequency: float, damping: float, drive: NDArray, sample_time: floa
     return drive[0] + lfilter(numerator.ravel()[1:], denominator, change)
 
 
+def _delayed(drive: NDArray, samples: int) -> NDArray:
+    """Return the drive `samples` later; before its beginning it was what it is there."""
+    return np.concatenate((np.full(samples, drive[0]), drive[: len(drive) - samples]))
+
+
 def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsModel:
-    """Identify natural frequency, damping ratio and gain from a step or a sweep of `drive`.
+    """Identify natural frequency, damping ratio, gain and delay from a step or a sweep of `drive`.
 
     Parameters
     ----------
@@ -83,8 +93,8 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
     time = measurement.time - measurement.time[0]
     columns = np.column_stack((np.ones_like(time), time))
 
-    def linear(frequency: float, damping: float) -> tuple[NDArray, NDArray]:
-        response = _respond(frequency, damping, drive, sample_time)
+    def linear(frequency: float, damping: float, delay: int) -> tuple[NDArray, NDArray]:
+        response = _respond(frequency, damping, _delayed(drive, delay), sample_time)
         regressors = np.column_stack((response, columns))
         scale = np.linalg.norm(regressors, axis=0)
         x = np.linalg.lstsq(regressors / scale, measurement.deflection, rcond=None)[0] / scale
@@ -94,17 +104,27 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
     start = min(
         ((w, d) for w in np.geomspace(2.0 * math.pi / time[-1], 0.98 * nyquist, FREQUENCIES)
          for d in DAMPING_RATIOS),
-        key=lambda guess: float(np.sum(linear(*guess)[1] ** 2)),
+        key=lambda guess: float(np.sum(linear(guess[0], guess[1], 0)[1] ** 2)),
     )  # fmt: skip
     spread = float(np.std(measurement.deflection))
-    found = least_squares(
-        lambda logs: linear(*np.exp(logs))[1] / spread, np.log(start), x_scale=(1e-3, 1e-1)
-    )
-    frequency, damping = np.exp(found.x).tolist()
+    # A delay looks like damping, so it is searched with the rest. Each search begins where the one
+    # with a sample less ended.
+    best, logs = None, np.log(start)
+    for delay in range(LONGEST_DELAY + 1):
+        found = least_squares(
+            lambda x, delay=delay: linear(math.exp(x[0]), math.exp(x[1]), delay)[1] / spread,
+            logs,
+            x_scale=(1e-3, 1e-1),
+        )
+        logs = found.x
+        if best is None or found.cost < best[0]:
+            best = found.cost, delay, np.exp(found.x).tolist()
+    assert best is not None
+    _, delay, (frequency, damping) = best
     if frequency >= nyquist:
         raise MeasurementError(
             f"{measurement.source}: no vibration below the Nyquist frequency of "
             f"{0.5 / sample_time:g} Hz; sample faster"
         )
-    gain, offset, slope = linear(frequency, damping)[0].tolist()
-    return DynamicsModel(frequency, damping, gain, offset, slope)
+    gain, offset, slope = linear(frequency, damping, delay)[0].tolist()
+    return DynamicsModel(frequency, damping, gain, offset, slope, delay)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from importlib.metadata import entry_points
 from typing import Any
 
 import numpy as np
@@ -30,8 +29,8 @@ from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.safety import FAULT, HOLDING, LARGEST_DEFLECTION, NORMAL, RAMPING
 from piezo_control.servo.clock import lateness_quantile
-from piezo_control.servo.driver import DriverError, SharedLibrary
-from piezo_control.servo.loop import Driver, Samples, Servo
+from piezo_control.servo.driver import DriverError, open_driver
+from piezo_control.servo.loop import Samples, Servo
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 
 STATE_PERIOD = 0.1  # s
@@ -42,18 +41,6 @@ PHASES = {
     FAULT: FingerState.FAULT,
 }
 LATCHED_PHASES = (FingerState.RAMPING, FingerState.FAULT)
-
-
-def open_driver(parameters: ServoNodeParameters, sample_time: float) -> Driver:
-    """Return the device of `parameters`, open.
-
-    A driver is a shared library, or what a package names in its entry points `piezo_gripper.drivers`.
-
-    Raises ParameterError for a driver that does not exist, DriverError when the device does not open.
-    """
-    for entry in entry_points(group="piezo_gripper.drivers", name=parameters.driver):
-        return entry.load()(parameters.driver_options, sample_time)
-    return SharedLibrary(parameters.driver, parameters.driver_options, sample_time)
 
 
 def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
@@ -123,7 +110,7 @@ class ServoNode(FingerNode):
                 )
         feedforward = read_feedforward(p)
         try:
-            driver = open_driver(p, controller.sample_time)
+            driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
         self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin)

@@ -9,8 +9,10 @@ so that it compiles with the loop.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from llvmlite import ir
@@ -29,6 +31,23 @@ SHIPPED = Path(__file__).parent / "drivers"
 
 class DriverError(RuntimeError):
     """A device that cannot be opened; the message is the driver's own."""
+
+
+class Driver(Protocol):
+    """A device that is open: what the loop calls, and what is called beside it."""
+
+    device: Any
+    """What `read` and `write` take; a named tuple whose array `reading` has the reading and its age (s)."""
+    read: Callable[..., int]
+    write: Callable[..., int]
+    """``read(device, edge)`` and ``write(device, voltage, edge)``, `edge` being the time of the present edge
+    (ns); both return what a C driver returns. They are compiled with the loop."""
+
+    def error(self) -> str:
+        """Return what went wrong last."""
+
+    def close(self) -> None:
+        """Let go of the device."""
 
 
 class Card(NamedTuple):
@@ -82,6 +101,18 @@ class SharedLibrary:
     def close(self) -> None:
         """Let go of the device."""
         self._functions.piezo_close(ctypes.c_void_p(self._device))
+
+
+def open_driver(name: str, options: str, sample_time: float) -> Driver:
+    """Return the device of a driver, open, for a loop of this sample time (s).
+
+    A driver is a shared library, or what a package names in its entry points `piezo_gripper.drivers`.
+
+    Raises ParameterError for a driver that does not exist, DriverError when the device does not open.
+    """
+    for entry in entry_points(group="piezo_gripper.drivers", name=name):
+        return entry.load()(options, sample_time)
+    return SharedLibrary(name, options, sample_time)
 
 
 def library(driver: str) -> Path:

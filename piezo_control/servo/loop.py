@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import FunctionType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, NORMAL, RAMPING
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
-from piezo_control.servo.driver import FAILED, FRESH
+from piezo_control.servo.driver import FAILED, FRESH, Driver
 from piezo_control.servo.driver import read_card as read
 from piezo_control.servo.driver import write_card as write
 from piezo_control.servo.law import (
@@ -49,23 +49,6 @@ from piezo_control.servo.parameters import ServoParameters
 AHEAD = 1.0  # s: how far references are laid out in advance
 MARGIN = 5  # samples that a new reference leaves to the loop, which is about to read them
 KEPT = 5.0  # s of samples that wait for a reader
-
-
-class Driver(Protocol):
-    """A device that is open: what the loop calls, and what is called beside it."""
-
-    device: Any
-    """What `read` and `write` take; a named tuple whose array `reading` has the reading and its age (s)."""
-    read: Callable[..., int]
-    write: Callable[..., int]
-    """``read(device, edge)`` and ``write(device, voltage, edge)``, `edge` being the time of the present edge
-    (ns); both return what a C driver returns. They are compiled with the loop."""
-
-    def error(self) -> str:
-        """Return what went wrong last."""
-
-    def close(self) -> None:
-        """Let go of the device."""
 
 
 class Orders(NamedTuple):

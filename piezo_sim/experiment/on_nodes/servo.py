@@ -113,11 +113,11 @@ def figures(bag: Path, seen: dict[str, Any]) -> tuple[dict[str, float], Recordin
     blocks = open_bag(bag).messages("/samples", BLOCK_TYPE)
     late = np.concatenate([block.late for block in blocks])
     begin = int(np.flatnonzero(recording.reference == STEP)[0])
-    part = slice(begin, begin + round(HELD / 1e-4) - 1)
+    answered = np.isfinite(recording.deflection)
+    part = np.flatnonzero(answered & (recording.reference == STEP))
     step = step_metrics(
         recording.time[part] - recording.time[begin], recording.deflection[part], STEP
     )
-    answered = np.isfinite(recording.deflection)
     return (
         {
             "settling into 5 % [ms]": 1e3 * float(step.settling_5_reference_s),

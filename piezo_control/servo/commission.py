@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an unknown card and finger to a directory that `servo` starts with, step by step.
+
+1. at rest: the sensor's zero and noise;
+2. a small step of the voltage: sign and gain of the sensor;
+3. a small sweep: delay in samples, resonance, damping;
+4. a decaying sine over the whole range: the hysteresis;
+5. the design: a controller for what was found, certified.
+
+Each step uses more voltage than the one before and asks first. The loop of the servo itself moves the finger,
+with its limits of voltage and slew; a silent or saturated sensor ends at rest.
+
+Exit code: 0 done, 1 the finger does not answer or the controller is not certified, 2 unusable input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: small matrices only
+
+import numpy as np  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.prompt import Confirm  # noqa: E402
+
+from piezo_control.design.certificate import certify  # noqa: E402
+from piezo_control.design.cli import comment, read_problem, show  # noqa: E402
+from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
+from piezo_control.feedback import FeedbackParameters  # noqa: E402
+from piezo_control.feedforward import FeedforwardParameters  # noqa: E402
+from piezo_control.hysteresis import deflection_history  # noqa: E402
+from piezo_control.identification.dynamics import identify_dynamics  # noqa: E402
+from piezo_control.identification.excitation import decaying_sine  # noqa: E402
+from piezo_control.identification.hysteresis import (  # noqa: E402
+    equal_thresholds,
+    identify_hysteresis,
+    quality,
+)
+from piezo_control.identification.measurement import Measurement, MeasurementError  # noqa: E402
+from piezo_control.parameters import ParameterError, dump, flatten  # noqa: E402
+from piezo_control.profile import Profile  # noqa: E402
+from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
+from piezo_control.servo.driver import DriverError, open_driver  # noqa: E402
+from piezo_control.servo.loop import Samples, Servo  # noqa: E402
+from piezo_control.servo.parameters import ServoParameters  # noqa: E402
+from piezo_control.shared import shared_folder  # noqa: E402
+
+VOLT = 1e-6  # m of reference per V: the loop is open here, and its command stands for a voltage
+PLAYS = 16
+SETTLING = 0.3  # s at rest before and after everything
+SWEEP = 1.0  # s
+SINE_CYCLES = 12
+LARGEST_RMS_PERCENT = 10.0  # of the stroke, as `identify`
+
+
+class NoAnswer(RuntimeError):
+    """A finger that does not do what one can go on with; the message says what it did."""
+
+
+@dataclass
+class Bench:
+    """What moves the finger, and what is known of its sensor so far."""
+
+    arguments: argparse.Namespace
+    limits: VoltageParameters
+    scale: float
+    zero: float = 0.0
+
+    def move(self, voltage: Profile, duration: float) -> Samples:
+        """Apply a voltage (V over s) for `duration` s and return every sample; starts and ends at rest.
+
+        Raises NoAnswer when the servo ends it, DriverError when the device does not open.
+        """
+        a = self.arguments
+        h = a.sample_time
+        parameters = ServoParameters(
+            write=a.write, sensor_scale=self.scale, sensor_zero=self.zero,
+            sensor_low=-LARGEST_DEFLECTION, sensor_high=LARGEST_DEFLECTION,
+            amplifier_gain=a.amplifier_gain, model_tolerance=LARGEST_DEFLECTION,
+            cycle_amplitude=LARGEST_DEFLECTION, missed_limit=10**6, late_share=1.0,
+        )  # fmt: skip
+        straight = FeedforwardParameters(
+            compensator="static_gain", static_gain=VOLT, **vars(self.limits)
+        )
+        whole = FeedbackParameters(
+            sample_time=h, command_low=VOLT * self.limits.voltage_low,
+            command_high=VOLT * self.limits.voltage_high,
+        )  # fmt: skip
+        servo = Servo(
+            open_driver(a.driver, a.driver_options, h), parameters, whole, straight, a.priority
+        )
+        servo.refer(Profile(voltage.time + SETTLING, VOLT * voltage.value, voltage.linear))
+        servo.start()
+        taken = []
+        try:
+            while servo.number * h < duration + 2.0 * SETTLING:
+                if servo.phase in (RAMPING, FAULT):
+                    raise NoAnswer(servo.cause)
+                time.sleep(0.02)
+                servo.look_ahead()
+                taken.append(servo.samples())
+        finally:
+            servo.stop()
+        return Samples(
+            *(np.concatenate([getattr(s, name) for s in taken]) for name in vars(taken[0]))
+        )
+
+    def measure(self, voltage: Profile, duration: float) -> Measurement:
+        """Return voltage and deflection on an even grid, each deflection with the voltage held before it.
+
+        A period that was missed held its voltage; its deflection, like one that came late, lies on the
+        line between its neighbours.
+        """
+        got = self.move(voltage, duration)
+        number = np.arange(got.number[0], got.number[-1] + 1)
+        held = np.searchsorted(got.number, number, side="right") - 1
+        there = np.isfinite(got.deflection)
+        deflection = np.interp(number, got.number[there], got.deflection[there])
+        return Measurement(
+            "commission", self.arguments.sample_time * (number - number[0])[1:],
+            got.voltage[held][:-1], deflection[1:], None, None, number[1:],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What the sensor reads at 0 V, m."""
+
+    mean: float
+    noise: float
+
+
+def at_rest(bench: Bench) -> Rest:
+    """Read the sensor at rest."""
+    got = bench.move(Profile([0.0], [0.0]), 0.2)
+    there = got.deflection[np.isfinite(got.deflection)]
+    if not there.size:
+        raise NoAnswer("the sensor gave no reading within half a second")
+    return Rest(float(there.mean()), float(there.std()))
+
+
+def gain(bench: Bench, rest: Rest, voltage: float) -> float:
+    """Return deflection per volt (m/V) of a small step; negative if the sensor or a wire is reversed."""
+    got = bench.move(Profile([0.0, 0.3], [voltage, 0.0]), 0.6)
+    there = np.isfinite(got.deflection)
+    up = there & (got.voltage == voltage)
+    # The second half of the step: the ringing is over.
+    moved = float(np.mean(got.deflection[up][up.sum() // 2 :])) - rest.mean
+    least = max(5.0 * rest.noise, 1e-12)
+    if not up.any() or abs(moved) < least:
+        raise NoAnswer(
+            f"{voltage:.3g} V moved the reading by {moved * 1e6:.3g} µm, less than five times its noise "
+            f"({rest.noise * 1e6:.3g} µm): sensor, amplifier or wiring?"
+        )
+    return moved / voltage
+
+
+def sweep(amplitude: float, duration: float, sample_time: float) -> Profile:
+    """Return a sine (V) whose frequency rises evenly to a third of the sampling rate."""
+    t = np.arange(0.0, duration, sample_time)
+    highest = 1.0 / (3.0 * sample_time)
+    values = amplitude * np.sin(math.pi * highest * t**2 / duration)
+    return Profile([*t, duration], [*values, 0.0])
+
+
+def commission(
+    bench: Bench, console: Console, agree: Callable[[str], bool]
+) -> tuple[Path, bool] | None:
+    """Go through the steps; return the written directory and whether the controller is certified.
+
+    None if somebody did not agree. `agree(question)` is asked before each step that moves the finger.
+    """
+    a = bench.arguments
+    low, high = bench.limits.voltage_low, bench.limits.voltage_high
+    reach = max(abs(low), abs(high))
+    side = 1.0 if high >= -low else -1.0
+    rest = at_rest(bench)
+    bench.zero = rest.mean / bench.scale
+    console.print(f"at rest: {rest.mean * 1e6:.4g} µm, noise {rest.noise * 1e9:.3g} nm rms")
+    small = a.share * reach * side
+    if not agree(f"step of {small:.3g} V?"):
+        return None
+    slope = gain(bench, Rest(0.0, rest.noise), small)
+    if slope < 0.0:
+        console.print("the sensor is reversed: its scale becomes negative")
+        bench.scale, slope = -bench.scale, -slope
+    console.print(f"gain: {slope * 1e6:.4g} µm/V, so {slope * (high - low) * 1e6:.3g} µm in all")
+    amplitude = 0.5 * small
+    if not agree(f"sweep of ±{abs(amplitude):.3g} V around {amplitude:.3g} V?"):
+        return None
+    wave = sweep(amplitude, SWEEP, a.sample_time)
+    swept = bench.measure(Profile(wave.time, amplitude + wave.value), SWEEP)
+    model = identify_dynamics(swept, swept.voltage)
+    fit = quality(swept.deflection, model.deflection(swept.time, swept.voltage))
+    console.print(
+        f"resonance {model.natural_frequency / (2.0 * math.pi):.1f} Hz, damping ratio "
+        f"{model.damping_ratio:.4f}, delay {model.delay_samples} samples (rms {fit.rms_percent:.1f} %)"
+    )
+    need(fit.rms_percent, "one resonance and a delay")
+    if not agree(f"decaying sine over the whole range, {low:g} to {high:g} V?"):
+        return None
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    sine = decaying_sine(half, SINE_CYCLES)
+    whole = Profile(sine.time, middle + sine.value, sine.linear)
+    slow = bench.measure(whole, float(sine.time[-1]))
+    # A reading in ten is enough for a sine of 1 Hz.
+    slow = slow.part(slice(None, None, max(1, round(1e-3 / a.sample_time))))
+    hysteresis = identify_hysteresis(slow, equal_thresholds(slow, PLAYS), lag=None)
+    shown = hysteresis.deflection(slow.time, slow.voltage)
+    fit = quality(slow.deflection, shown)
+    console.print(f"hysteresis: rms {fit.rms_percent:.2f} % of {fit.stroke * 1e6:.3g} µm")
+    need(fit.rms_percent, "the hysteresis")
+    folder: Path = a.out
+    folder.mkdir(parents=True, exist_ok=True)
+    origin = f"Commissioned on driver '{a.driver}' ({a.driver_options or 'no options'})."
+    limits = vars(bench.limits)
+    operator = {f"hysteresis.{n}": v for n, v in flatten(hysteresis.parameters).items()}
+    dump(folder / "feedforward.yaml", "feedforward", {**limits, **operator}, origin)
+    finger = {
+        **operator,
+        "sample_time": a.sample_time,
+        "dynamics.denominator": model.denominator,
+        "sensor.delay_samples": model.delay_samples,
+        "sensor.noise": rest.noise,
+        **{f"amplifier.{name}": value for name, value in limits.items()},
+    }
+    dump(folder / "cantilever.yaml", "cantilever", finger, origin)
+    reached = deflection_history(hysteresis.parameters, slow.voltage)
+    margin = 0.25 * float(np.ptp(reached))
+    problem = read_problem(a.problem, folder / "cantilever.yaml")
+    design = synthesize(problem)
+    certificate = certify(design.problem, design.controller, design.gamma)
+    show(console, certificate)
+    controller = replace(design.controller, certified=certificate.met)
+    dump(folder / "feedback.yaml", "feedback", flatten(controller), comment(certificate, a.problem))
+    servo = {
+        "driver": a.driver,
+        "driver_options": a.driver_options,
+        "write": a.write,
+        "delay_samples": model.delay_samples - (a.write == "next_edge"),
+        "sensor_scale": bench.scale,
+        "sensor_zero": bench.zero,
+        "sensor_low": float(reached.min()) - margin,
+        "sensor_high": float(reached.max()) + margin,
+        "amplifier_gain": a.amplifier_gain,
+        "controller_file": str((folder / "feedback.yaml").resolve()),
+        "feedforward_file": str((folder / "feedforward.yaml").resolve()),
+    }
+    dump(folder / "servo.yaml", "servo", servo, origin)
+    return folder, certificate.met
+
+
+def need(rms_percent: float, what: str) -> None:
+    """Raise NoAnswer for a fit that explains too little."""
+    if not rms_percent <= LARGEST_RMS_PERCENT:
+        raise NoAnswer(
+            f"{what} explain too little: rms {rms_percent:.1f} % of the stroke, must be at most "
+            f"{LARGEST_RMS_PERCENT:g} %"
+        )
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    a = parse()
+    console = Console()
+    try:
+        if (a.out / "servo.yaml").exists() and not a.overwrite:
+            raise ParameterError(f"{a.out} has a servo.yaml; name a new --out or give --overwrite")
+        limits = VoltageParameters(a.voltage_low, a.voltage_high, a.slew_limit)
+        found = commission(
+            Bench(a, limits, a.sensor_scale),
+            console,
+            lambda question: a.yes or Confirm.ask(question, console=console),
+        )
+    except (ParameterError, DriverError) as error:
+        print(f"commission: {error}", file=sys.stderr)
+        return 2
+    except (NoAnswer, MeasurementError, SynthesisError) as error:
+        print(f"commission: {error}", file=sys.stderr)
+        return 1
+    if found is None:
+        console.print("stopped; the finger is at rest, nothing was written")
+        return 1
+    folder, is_certified = found
+    console.print(f"wrote {folder}; start it with", soft_wrap=True)
+    console.print(
+        f"  ros2 run piezo_gripper servo --ros-args --params-file {folder}/servo.yaml",
+        soft_wrap=True,
+    )
+    if not is_certified:
+        print("commission: the controller is NOT certified, see the table", file=sys.stderr)
+    return 0 if is_certified else 1
+
+
+def parse() -> argparse.Namespace:
+    """Return the command line's arguments."""
+    parser = argparse.ArgumentParser(
+        prog="commission", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--driver", default="simulated", help="as the servo's (%(default)s)")
+    parser.add_argument("--driver-options", default="", metavar="TEXT")
+    parser.add_argument(
+        "--sample-time", type=float, default=1e-4, metavar="S", help="(%(default)s)"
+    )
+    parser.add_argument("--write", choices=("immediately", "next_edge"), default="immediately")
+    parser.add_argument("--priority", type=int, default=80, help="real-time priority (%(default)s)")
+    limits = VoltageParameters()
+    for name, unit in (("voltage_low", "V"), ("voltage_high", "V"), ("slew_limit", "V/s")):
+        parser.add_argument(
+            f"--{name.replace('_', '-')}", type=float, default=getattr(limits, name), metavar=unit,
+            help="what the finger stands (%(default)s)",
+        )  # fmt: skip
+    parser.add_argument(
+        "--sensor-scale", type=float, default=1.0, metavar="M",
+        help="size of the sensor's scale: m per unit of the card; the sign is found (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--amplifier-gain", type=float, default=1.0, metavar="V",
+        help="V at the finger per unit that the card puts out (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--share", type=float, default=0.1, help="of the voltage for the first steps (%(default)s)"
+    )
+    parser.add_argument(
+        "--problem", type=Path, default=shared_folder() / "params" / "synthesis_robust.yaml",
+        help="design problem (synthesis_robust.yaml)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, default=Path("commissioned"), help="(%(default)s)")
+    parser.add_argument("--overwrite", action="store_true", help="replace what is in --out")
+    parser.add_argument("--yes", action="store_true", help="do not ask before each step")
+    return parser.parse_args()
