@@ -10,12 +10,15 @@ from piezo_control.nodes.feedback import FeedbackNode
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
 from piezo_control.nodes.recorder import RecorderNode
+from piezo_control.nodes.servo import ServoNode
 from piezo_control.parameters import declarations
 from piezo_sim.experiment.cases import EXPERIMENT_KEYS, RUN_KEYS
 from piezo_sim.nodes.cantilever import CantileverNode
 from piezo_sim.nodes.temperature import TemperatureNode
 
-NODES = (CantileverNode, TemperatureNode, FeedforwardNode, FeedbackNode, RecorderNode, GripperNode)
+NODES = (
+    CantileverNode, TemperatureNode, FeedforwardNode, FeedbackNode, ServoNode, RecorderNode, GripperNode,
+)  # fmt: skip
 LONGEST = 40  # characters of a default that a table still shows
 HEAD = """# Parameters
 

@@ -26,6 +26,9 @@ EXECUTABLES = {
     "synthesize",
     "monte_carlo",
     "gripper",
+    "servo",
+    "commission",
+    "udp_finger",
 }
 
 # From ros/rosdistro: packages released into jazzy/distribution.yaml ...
