@@ -2,6 +2,7 @@
 """D(s) and the elastic constant from the simulated finger, seen through its sensor."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,3 +94,14 @@ def test_constant_drive_is_refused():
     measurement = measured(step(40.0, 200), np.zeros(200))
     with pytest.raises(MeasurementError, match="the drive is constant"):
         identify_dynamics(measurement, np.ones(200))
+
+
+@pytest.mark.parametrize("late", [0, 1, 3])
+def test_a_delay_is_found_and_is_not_taken_for_damping(late):
+    """Fitted without a delay, three samples turn the damping ratio of 0.017 into 0.05."""
+    measurement = measured(step(20.0, 800), np.zeros(800))
+    shifted = np.concatenate((np.zeros(late), measurement.deflection))[:800]
+    model = identify_dynamics(replace(measurement, deflection=shifted), measurement.voltage)
+    assert model.delay_samples == late
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
+    assert model.damping_ratio == pytest.approx(DAMPING, rel=0.1)
