@@ -461,7 +461,8 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     stand.finger.kill()
     stand.finger.wait()
     stand.wait(lambda: stand.phase == FingerState.FAULT)
-    assert stand.states[-1].text == "no reading of the sensor for 2 s"
+    expected = "no reading of the sensor for 2 s: nobody answers at this address"
+    assert stand.states[-1].text == expected
     assert stand.states[-1].voltage == 0.0
     stand.finger = stand.start_finger()
     assert stand.call(Trigger, "servo/reset", Trigger.Request()).success

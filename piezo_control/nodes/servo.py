@@ -118,6 +118,7 @@ class ServoNode(FingerNode):
         self._told = self._since = time.monotonic()
         self._rates = [(self._told, 0)]
         self._errors.clear()
+        self._complained = False
         self.servo.start()
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()
@@ -182,6 +183,9 @@ class ServoNode(FingerNode):
         """Keep the loop supplied with references, and say what it does."""
         if self.servo:
             self.servo.look_ahead()
+            if self.servo.complaint and not self._complained:
+                self.get_logger().warning(self.servo.complaint)
+                self._complained = True
             self._follow_phase()
             self._publish_samples()
 

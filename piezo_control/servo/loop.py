@@ -31,6 +31,7 @@ from piezo_control.servo.law import (
     CAUSES,
     DEVICE,
     NO_CAUSE,
+    SENSOR_SILENT,
     STOPPED,
     Laws,
     Settings,
@@ -342,7 +343,7 @@ class Servo:
         if code == NO_CAUSE:
             return ""
         text = CAUSES[code](float(watch.cause_value[0]), self.parameters)
-        said = self.driver.error() if code == DEVICE else ""
+        said = self.driver.error() if code in (DEVICE, SENSOR_SILENT) else ""
         return f"{text}: {said}" if said else text
 
     @property
