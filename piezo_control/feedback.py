@@ -115,6 +115,45 @@ class FeedbackParameters:
         return np.reshape(values, shape) if values else np.zeros(shape)
 
 
+def uncovered(
+    parameters: FeedbackParameters,
+    delay_samples: int,
+    denominator: Sequence[float],
+    reach: tuple[float, float],
+) -> list[str]:
+    """Return what the controller's certificate does not cover on a finger, in words; empty: nothing.
+
+    Parameters
+    ----------
+    delay_samples, denominator, reach
+        Delay from voltage to reading, D(s), and the deflections (m) that the finger reaches.
+    """
+    p = parameters
+    if p.controller == "none":
+        return []
+    if not p.certified:
+        return ["it is not certified"]
+    found = []
+    if p.delay_samples != delay_samples:
+        found.append(
+            f"it was made for a delay of {p.delay_samples} samples, here are {delay_samples}"
+        )
+    if p.denominator and not np.allclose(p.denominator, denominator, rtol=1e-6, atol=0.0):
+        wanted, here = (
+            math.sqrt(1.0 / d[0]) / (2.0 * math.pi) for d in (p.denominator, denominator)
+        )
+        found.append(
+            f"it was made for a resonance of {wanted:.1f} Hz and D(s) {list(p.denominator)}, this finger has "
+            f"{here:.1f} Hz and {list(denominator)}; its box covers some of that"
+        )
+    if p.command_low < reach[0] - 1e-9 or p.command_high > reach[1] + 1e-9:
+        found.append(
+            f"its commands of {p.command_low * 1e6:g} to {p.command_high * 1e6:g} µm leave the finger's reach of "
+            f"{reach[0] * 1e6:.4g} to {reach[1] * 1e6:.4g} µm"
+        )
+    return found
+
+
 class FeedbackCoefficients(NamedTuple):
     """What :func:`feedback_step` reads; the arrays are indexables of floats, `a` row-major."""
 

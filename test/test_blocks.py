@@ -3,9 +3,11 @@
 
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 
 from piezo_control.recording.recording import BLOCK_TYPE, PROFILE_TYPE, SAMPLE_TYPE, read
 from piezo_control.recording.writer import BagWriter
+from piezo_gripper_msgs.msg import Profile, Sample, SampleBlock
 
 H = 1e-4
 WALL = 1_700_000_000 * 10**9  # ns
@@ -16,11 +18,11 @@ def bag(tmp_path):
     return BagWriter(tmp_path / "bag")
 
 
-def make(writer, kind, nanoseconds, **fields):
-    types = writer.typestore.types
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
-    fields["header"] = types["std_msgs/msg/Header"](stamp, "")
-    return writer.typestore.serialize_cdr(types[kind](**fields), kind)
+def make(kind, nanoseconds, **fields):
+    """Return a serialized message with this stamp."""
+    message = kind(**fields)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
+    return serialize_message(message)
 
 
 def test_blocks_are_read_as_samples_and_a_missed_number_is_left_out(bag):
@@ -35,10 +37,10 @@ def test_blocks_are_read_as_samples_and_a_missed_number_is_left_out(bag):
         stamp = WALL + first * 100_000
         block = {name: signal[first:last] for name, signal in signals.items()}
         block["late"] = np.zeros(last - first)
-        bag.write(connection, stamp, make(bag, BLOCK_TYPE, stamp, number=first, period=H, **block))
+        bag.write(connection, stamp, make(SampleBlock, stamp, number=first, period=H, **block))
         bag.write(
             single, stamp,
-            make(bag, SAMPLE_TYPE, stamp, number=first, value=0.0, period=H, limited=False),
+            make(Sample, stamp, number=first, value=0.0),
         )  # fmt: skip
     bag.close()
     got = read(bag.path)
@@ -59,19 +61,17 @@ def test_the_reference_is_that_of_each_moment(bag, receives):
     points = bag.add("/reference", SAMPLE_TYPE, False)
 
     def profile(at, value):
-        data = make(
-            bag, PROFILE_TYPE, 0, interpolation=0, time=np.array([0.0]), value=np.array([value])
-        )
+        data = make(Profile, 0, time=[0.0], value=[value])
         bag.write(profiles, offset + at, data)
 
     profile(0, 5e-6)
     for k in range(3000):
         if k == 1000:
-            data = make(bag, SAMPLE_TYPE, 0, number=0, value=10e-6, period=0.0, limited=False)
+            data = make(Sample, 0, number=0, value=10e-6)
             bag.write(points, offset + k * 100_000, data)
         if k == 2000:
             profile(k * 100_000, -5e-6)
-        data = make(bag, SAMPLE_TYPE, k * 100_000, number=k, value=0.0, period=H, limited=False)
+        data = make(Sample, k * 100_000, number=k, value=0.0)
         bag.write(samples, offset + k * 100_000, data)
     bag.close()
     expected = np.repeat([5e-6, 10e-6, -5e-6], 1000)

@@ -12,11 +12,11 @@ import yaml
 from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
-from piezo_control.parameters import ParameterError
+from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
 from piezo_sim.experiment import cli, paper, results
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
-from piezo_sim.experiment.cases import multisine, profile, read_experiment
+from piezo_sim.experiment.cases import multisine, not_covered, profile, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
 
 LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
@@ -389,3 +389,19 @@ def test_multisine_has_the_lines_it_says():
 
 def test_every_figure_has_a_heading(short):
     assert set().union(*(r.figures for r in short[1])) <= set(QUANTITIES)
+
+
+def test_what_a_certificate_does_not_cover_is_said(tmp_path):
+    """Another delay, another resonance, a finger that reaches less, and the paper's K, which has none."""
+    finger = {"sensor.delay_samples": 2, "dynamics.denominator": (6.5e-8, 8.1e-6, 1.0)}
+    dump(tmp_path / "cantilever.yaml", "cantilever", finger)
+    dump(tmp_path / "feedforward.yaml", "feedforward", {"voltage_high": 20.0})
+    _, cases = read_experiment("step", {"params": tmp_path, "controller": "robust"})
+    delay, dynamics, reach = not_covered(cases)
+    assert delay.startswith("controller 'robust': it was made for a delay of 1 samples, here are 2")
+    # 1 / (2 pi sqrt(a2))
+    assert "made for a resonance of 666.6 Hz" in dynamics and "has 624.3 Hz" in dynamics
+    assert "leave the finger's reach" in reach
+    assert not_covered(read_experiment("step", {"controller": "robust"})[1]) == []
+    paper = not_covered(read_experiment("step", {"controller": "paper"})[1])
+    assert paper == ["controller 'paper': it is not certified"]

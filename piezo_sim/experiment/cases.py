@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from piezo_control.feedback import uncovered
 from piezo_control.feedforward import Feedforward
 from piezo_control.identification.excitation import decaying_sine
 from piezo_control.nodes.parameters import (
@@ -166,6 +167,22 @@ def own_parameters(folder: Path | None, node: str) -> dict[str, Any]:
     """
     path = folder / f"{node}.yaml" if folder else None
     return load(path, node) if path and path.exists() else {}
+
+
+def not_covered(cases: Iterable[Case]) -> list[str]:
+    """Return what the certificates of the cases' controllers do not cover on their fingers, each once."""
+    found: dict[str, None] = {}
+    for case in cases:
+        if case.mode != "feedback":
+            continue
+        nodes = case.parameters()
+        plant = nodes["cantilever"]
+        reach = Feedforward(nodes["feedforward"], case.sample_time).reachable_range
+        for text in uncovered(
+            nodes["feedback"], plant.sensor.delay_samples, plant.dynamics.denominator, reach
+        ):
+            found[f"controller '{case.controller}': {text}"] = None
+    return list(found)
 
 
 class RunFailed(RuntimeError):

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.analysis import ANALYSES
-from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, read_experiment
+from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, not_covered, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
 from piezo_sim.experiment.report import Section, print_table, write_html
 
@@ -63,6 +63,8 @@ def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -
     title, cases = read_experiment(arguments.command, overrides(arguments))
     for case in cases:
         case.parameters()  # refuse what cannot run before anything does
+    for text in not_covered(cases):
+        print(f"experiment: not covered by the certificate: {text}", file=sys.stderr)
     with results_folder(out, arguments.overwrite) as folder:
         run_into(folder, arguments, title, cases, console)
 
