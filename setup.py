@@ -24,7 +24,8 @@ setup(
     packages=find_packages(include=["piezo_control*", "piezo_sim*"]),
     package_data={"": ["*.html", "*.j2", "*.css", "*.h"]},
     ext_modules=[  # plain shared libraries, drivers of the servo
-        Extension("piezo_control.servo.drivers.udp", ["piezo_control/servo/drivers/udp.c"]),
+        Extension(f"piezo_control.servo.drivers.{name}", [f"piezo_control/servo/drivers/{name}.c"])
+        for name in ("iio", "udp")
     ],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The servo: its law against the engine, every guard on its cause, the loop in real time, the node."""
 
+import ctypes
 import json
 import math
 import signal
@@ -29,7 +30,14 @@ from piezo_control.parameters import ParameterError, load
 from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING
 from piezo_control.servo import law
-from piezo_control.servo.driver import FAILED, FRESH, NONE_IN_TIME, DriverError, SharedLibrary
+from piezo_control.servo.driver import (
+    FAILED,
+    FRESH,
+    NONE_IN_TIME,
+    DriverError,
+    SharedLibrary,
+    library,
+)
 from piezo_control.servo.law import laws_of, put_controller, servo_step, settings_of, watch_at_rest
 from piezo_control.servo.loop import Servo
 from piezo_control.servo.parameters import ServoParameters
@@ -312,7 +320,7 @@ def test_a_servo_in_this_process():
 
 def test_a_device_that_is_not_there_is_named(tmp_path):
     with pytest.raises(
-        ParameterError, match="must be 'simulated', one of the shipped udp, or the path"
+        ParameterError, match="must be 'simulated', one of the shipped iio, udp, or the path"
     ):
         SharedLibrary("nowhere", "", H)
     with pytest.raises(DriverError, match="options are 'nonsense', must be HOST:PORT"):
@@ -323,7 +331,29 @@ def test_a_device_that_is_not_there_is_named(tmp_path):
         SharedLibrary(str(no_driver), "", H)
 
 
-def test_the_example_driver_compiles_without_a_warning(tmp_path):
+def test_converters_of_linux_are_read_and_written_by_their_files(tmp_path):
+    """Ordinary files in place of those in sysfs."""
+    source, sink = tmp_path / "in_voltage0_raw", tmp_path / "out_voltage0_raw"
+    source.write_text("1234\n")
+    sink.write_text("")
+    driver = SharedLibrary("iio", f"{source} {sink}", H)
+    functions, device = ctypes.CDLL(str(library("iio"))), ctypes.c_void_p(driver.device.device)
+    reading = (ctypes.c_double * 2)()
+    assert functions.piezo_read(device, reading) == FRESH and list(reading) == [1234.0, 0.0]
+    source.write_text("-7\n")
+    assert functions.piezo_read(device, reading) == FRESH and reading[0] == -7.0
+    source.write_text("")
+    assert functions.piezo_read(device, reading) == NONE_IN_TIME
+    assert functions.piezo_write(device, ctypes.c_double(-2047.6)) == FRESH
+    assert sink.read_text() == "-2048\n"
+    driver.close()
+    with pytest.raises(DriverError, match="no_file: No such file or directory"):
+        SharedLibrary("iio", f"{tmp_path / 'no_file'} {sink}", H)
+    with pytest.raises(DriverError, match="must be the files of input and output"):
+        SharedLibrary("iio", str(source), H)
+
+
+def test_the_drivers_compile_without_a_warning(tmp_path):
     compiler = sysconfig.get_config_var("CC").split()[0]
     sources = Path(__file__).parents[1] / "piezo_control" / "servo" / "drivers"
     for source in sources.glob("*.c"):
