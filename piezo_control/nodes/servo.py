@@ -119,6 +119,7 @@ class ServoNode(FingerNode):
         self._rates = [(self._told, 0)]
         self._errors.clear()
         self._complained = False
+        self.get_logger().info("the loop is compiled, if it was not before: half a minute or so")
         self.servo.start()
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()

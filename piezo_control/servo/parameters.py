@@ -70,7 +70,7 @@ class ServoParameters(SafetyParameters):
         100, "periods missed one after the other that end in a fault", low=0, high=10**6
     )
     late_share: float = parameter(
-        0.1, "share of the periods of five windows that may be late by half a period, or missed",
+        0.2, "share of the periods of five windows that may be late by half a period, or missed",
         low=0.0, high=1.0,
     )  # fmt: skip
 
