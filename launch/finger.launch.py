@@ -3,28 +3,26 @@
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterFile
-from launch_ros.substitutions import FindPackageShare
+from launch_ros.parameter_descriptions import ParameterValue
 
 ARGUMENTS = {
     "namespace": ("finger", "namespace of the finger's nodes and topics"),
-    "controller": ("robust", "controller: params/feedback_<controller>.yaml"),
+    "controller": ("robust", "controller: a shipped name, or the path of a parameter file"),
     "mode": ("lockstep", "lockstep or free_running"),
     "sample_time": ("0.0001", "sample time in s; that of the controller's design"),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    params = PathJoinSubstitution([FindPackageShare("piezo_gripper"), "params"])
-    controller = LaunchConfiguration("controller")
+    controller = ParameterValue(LaunchConfiguration("controller"), value_type=str)
     common = {"mode": LaunchConfiguration("mode")}
     sampled = {**common, "sample_time": LaunchConfiguration("sample_time")}
     nodes = {
         "temperature": [common],
         "feedforward": [sampled],
-        "feedback": [ParameterFile([params, "/feedback_", controller, ".yaml"]), common],
+        "feedback": [{**common, "controller_file": controller}],
         "cantilever": [{**sampled, "temperature_lockstep": True}],
     }
     return LaunchDescription(
