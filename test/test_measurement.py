@@ -39,7 +39,7 @@ def write_bag(path, voltage, deflection, temperature=None, sample_time=1e-3, pre
                 nanoseconds = round(number * sample_time * 1e9)
                 at = header(stamp(*divmod(nanoseconds, 10**9)), "")
                 message = (
-                    store.types[kind](at, number, value, sample_time, False)
+                    store.types[kind](at, number, value, sample_time, False, False, False)
                     if kind == SAMPLE
                     else store.types[kind](at, value, 0.0)
                 )

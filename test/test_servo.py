@@ -420,6 +420,7 @@ class Stand:
         finger = self.start(
             "udp_finger", "--port", str(self.port), "--cantilever", str(self.folder / "finger.yaml"),
             "--report", str(self.folder / "report.json"), "--scale=-5e4", "--zero", "1.0",
+            "--priority", "70",
         )  # fmt: skip
         wait(lambda: self.log("udp_finger").count("answers") > before, "the finger answers")
         self.port = int(self.log("udp_finger").rsplit(":", 1)[1].split()[0])
