@@ -237,6 +237,22 @@ def apply(
     return voltage
 
 
+def expected(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
+    """Return the static deflection (m) that the models expect at the end of a sample at `voltage` (V)."""
+    total = thermal_deflection(c.thermal, s.body)
+    for i in range(len(s.relaxations)):
+        total += s.relaxations[i]
+    return heated(c.thermal, static(c, s), voltage, warmth) + total
+
+
+def static(c: SensorlessCoefficients, s: SensorlessState) -> float:
+    """Return the deflection (m) of the hysteresis at 22 °C."""
+    total = 0.0
+    for i in range(len(c.operator.weights)):
+        total += c.operator.weights[i] * s.hysteresis.plays[i]
+    return total
+
+
 FROM_REST, BY_REFERENCE, BY_CONTROLLER = range(3)
 
 
@@ -286,7 +302,7 @@ class Sensorless:
         self._check("command", command, temperature_degc)
         s = self.state
         if self._led == BY_REFERENCE:
-            s.offset[0] = self._static() - command
+            s.offset[0] = static(self.coefficients, s) - command
         self._led = BY_CONTROLLER
         warmth = s.body.degc[0] - REFERENCE_DEGC
         voltage = inverse_step(self.coefficients, s, command, temperature_degc, share)
@@ -338,12 +354,5 @@ class Sensorless:
                 f"{name} is {value!r} m, temperature is {temperature_degc!r} °C; must be finite"
             )
 
-    def _static(self) -> float:
-        """Return the deflection (m) of the hysteresis at 22 °C."""
-        c, plays = self.coefficients.operator, self.state.hysteresis.plays
-        return sum(weight * play for weight, play in zip(c.weights, plays, strict=True))
-
     def _predict(self, voltage: float, warmth: float) -> None:
-        c, s = self.coefficients, self.state
-        drift = thermal_deflection(c.thermal, s.body) + sum(s.relaxations)
-        self.predicted = heated(c.thermal, self._static(), voltage, warmth) + drift
+        self.predicted = expected(self.coefficients, self.state, voltage, warmth)

@@ -46,6 +46,17 @@ from piezo_control.sensorless import (
     sensorless_step,
 )
 from piezo_control.sequence import grid_index
+from piezo_control.touch import (
+    TouchCoefficients,
+    TouchParameters,
+    TouchState,
+    feel,
+    follow,
+    press,
+    push_of,
+    touch_coefficients,
+    touch_rest,
+)
 from piezo_sim.plant import cantilever
 from piezo_sim.plant.cantilever import (
     CantileverModel,
@@ -102,6 +113,17 @@ class SensorlessFinger(NamedTuple):
     law_state: SensorlessState
     plant: CantileverModel
     plant_state: CantileverState
+
+
+class TouchingFinger(NamedTuple):
+    """Coefficients and states of a finger that holds a force; the last two are of every sample."""
+
+    law: TouchCoefficients
+    law_state: TouchState
+    plant: CantileverModel
+    plant_state: CantileverState
+    max_force: np.ndarray  # N
+    push: np.ndarray  # N, as estimated
 
 
 class Finger(NamedTuple):
@@ -191,6 +213,40 @@ def run_sensorless(
         run_sensorless_samples, finger, clipped, plant, temperatures, reference, samples, tip_force,
         every, compiled,
     )  # fmt: skip
+
+
+def run_touching(
+    plant: CantileverParameters,
+    touch: TouchParameters,
+    temperatures: TemperatureParameters,
+    reference: Profile,
+    max_force: Profile,
+    samples: int,
+    compiled: bool | None = None,
+) -> tuple[Run, np.ndarray]:
+    """Run a finger that pushes with `max_force` (N) at most; return it and the estimated push (N).
+
+    Other parameters as in :func:`run`. Raises ParameterError when the models have no inverse.
+    """
+    degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
+    law = touch_coefficients(touch, plant.sample_time)
+    sampled = cantilever.model(plant)
+    finger = as_arrays(
+        TouchingFinger(
+            law,
+            touch_rest(law, degc),
+            sampled,
+            cantilever.rest(sampled, plant.sensor.delay_samples, degc),
+            max_force.at(np.arange(samples) * plant.sample_time),
+            np.empty(samples),
+        )
+    )
+    clipped = finger.law_state.models.clipped
+    got = _run(
+        run_touching_samples, finger, clipped, plant, temperatures, reference, samples, None, 1,
+        compiled,
+    )  # fmt: skip
+    return got, finger.push
 
 
 def temperatures_of(
@@ -428,6 +484,32 @@ def run_sensorless_samples(
             row = (first + n) // every
             outputs.deflection[row] = state.readings[0]
             outputs.command[row] = reference
+            outputs.voltage[row] = voltage
+            outputs.total_force[row] = state.tip_force[0]
+            outputs.true_deflection[row] = deflection_of(plant, state)
+        advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
+
+
+def run_touching_samples(
+    finger: TouchingFinger, inputs: Inputs, first: int, every: int, outputs: Outputs
+) -> None:
+    """Run the samples of `inputs` with a force that is limited, the first one being number `first`."""
+    law = finger.law
+    law_state = finger.law_state
+    plant = finger.plant
+    state = finger.plant_state
+    for n in range(len(inputs.reference)):
+        look(plant, state, inputs.normal[n], inputs.uniform[n])
+        deflection = state.readings[0]
+        feel(law, law_state, deflection)
+        limit = finger.max_force[first + n]
+        command = press(law, law_state, inputs.reference[n], deflection, limit)
+        voltage = follow(law, law_state, command, inputs.temperature[n], 1.0)
+        finger.push[first + n] = push_of(law, law_state)
+        if (first + n) % every == 0:
+            row = (first + n) // every
+            outputs.deflection[row] = deflection
+            outputs.command[row] = command
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)

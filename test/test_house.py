@@ -15,7 +15,7 @@ LEVELS = [
     {"parameters", "profile", "metrics", "safety", "sequence", "shared", "compiled", "start"},
     {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
     {"shaping", "feedforward", "sensorless", "thermometer", "design"},
-    {"identification", "servo"},
+    {"identification", "servo", "touch"},
     {"nodes"},
     {"plant", "temperature"},
     {"engine", "sim_nodes", "driver", "udp_finger"},
