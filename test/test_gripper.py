@@ -36,7 +36,7 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_sim.experiment.cases import params_folder
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
-TIMEOUT = 20.0  # s, generous: the tests wait on conditions
+TIMEOUT = 90.0  # s, generous: the tests wait on conditions
 SIDES = ("left", "right")
 DEFAULTS = GripperParameters()
 

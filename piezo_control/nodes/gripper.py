@@ -19,11 +19,10 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.action.server import ServerGoalHandle
 from rclpy.duration import Duration
 
 from piezo_control.gripper import (
+    Goal,
     GripperParameters,
     Motion,
     Outcome,
@@ -35,11 +34,12 @@ from piezo_control.gripper import (
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes import spin
 from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.faces.actions import GripFace
+from piezo_control.nodes.faces.asker import Asker, Measured
 from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
-from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
@@ -71,20 +71,6 @@ class GripperNodeParameters(GripperParameters):
         super().__post_init__()
         if len(set(self.fingers)) != 2 or len(self.fingers) != 2:
             raise ParameterError(f"'fingers' is {list(self.fingers)}, must be two different names")
-
-
-class DeferredActionServer(ActionServer):
-    """An action server whose goals are moved on by events; `notify_execute` with a callback ends one.
-
-    An execute callback that waits would stop the node's only thread, and one that awaits is polled by
-    rclpy 7's executors without a pause (measured: a full core). Here `execute()` only says EXECUTING.
-    """
-
-    def notify_execute(
-        self, goal_handle: ServerGoalHandle, execute_callback: Callable | None
-    ) -> None:
-        if execute_callback is not None:
-            super().notify_execute(goal_handle, execute_callback)
 
 
 class Finger:
@@ -165,18 +151,14 @@ class GripperNode(FingerNode):
     def __init__(self) -> None:
         super().__init__()
         self.fingers: list[Finger] = []
-        self.goal: Any = None  # ServerGoalHandle; None when there is no goal
         self.motion: Motion | None = None
+        self.asker: Asker | None = None  # whose motion it is
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
-        self.server = DeferredActionServer(
-            self, Grip, "grip", ServerGoalHandle.abort,
-            goal_callback=self._on_goal,
-            handle_accepted_callback=self._on_accepted,
-            cancel_callback=self._on_cancel,
-        )  # fmt: skip
+        self.faces = [GripFace(self, "grip")]
 
     def destroy_node(self) -> None:
-        self.server.destroy()
+        for face in self.faces:
+            face.destroy()
         super().destroy_node()
 
     def start(self) -> None:
@@ -189,38 +171,42 @@ class GripperNode(FingerNode):
     def stop(self) -> None:
         self.watchdog.cancel()
         self.active = False  # no goal from here on
-        if self.goal is not None:
-            self._give_up(self.goal)
+        if self.asker is not None:
+            self._give_up(self.asker)
         for finger in self.fingers:
             finger.release()
         self.fingers = []
 
-    # --- the action's callbacks ---------------------------------------------------------------------
+    # --- what the faces use -------------------------------------------------------------------------
 
-    def _on_goal(self, request: Grip.Goal) -> GoalResponse:
-        try:
-            if not self.active:
-                raise ValueError("the gripper is not active")
-            check_goal(self.parameters, request.opening, request.max_force, request.speed)
-            for finger in self.fingers:
-                if finger.problem():
-                    raise ValueError(finger.problem())
-        except ValueError as error:
-            self.get_logger().error(f"goal refused: {error}")
-            return GoalResponse.REJECT
-        return GoalResponse.ACCEPT
+    def check_goal(self, opening: float, max_force: float, speed: float) -> Goal:
+        """Return the goal; a ValueError says why the gripper cannot go for it now."""
+        if not self.active:
+            raise ValueError("the gripper is not active")
+        goal = check_goal(self.parameters, opening, max_force, speed)
+        for finger in self.fingers:
+            if finger.problem():
+                raise ValueError(finger.problem())
+        return goal
 
-    def _on_accepted(self, handle: ServerGoalHandle) -> None:
-        if self.goal is not None:
-            self._finish(ServerGoalHandle.abort, failure("a new goal takes over"))
-        request = handle.request
-        goal = check_goal(self.parameters, request.opening, request.max_force, request.speed)
+    def move(self, goal: Goal, asker: Asker) -> None:
+        """Go for a goal from where the fingers are; whoever else asked for a motion is told so."""
+        if self.asker is not asker:
+            self._finish(failure("a new goal takes over"))
         self.motion = Motion(self.parameters, goal, [finger.place() for finger in self.fingers])
-        self.goal = handle
-        handle.execute()
+        self.asker = asker
 
-    def _on_cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        return CancelResponse.ACCEPT if handle is self.goal else CancelResponse.REJECT
+    def halt(self, reason: str) -> None:
+        """Hold the fingers where they are; a motion ends because of `reason`."""
+        self._halt_motion(failure(reason))
+
+    def measured(self) -> Measured:
+        """Return what the newest states say."""
+        states = [finger.state for finger in self.fingers]
+        return Measured(
+            opening_of(self.parameters, [s.deflection for s in states]),
+            force_of([s.tip_force for s in states]),
+        )
 
     # --- the motion, moved on by the fingers' states ------------------------------------------------
 
@@ -232,9 +218,7 @@ class GripperNode(FingerNode):
         if not reason and motion.departed(finger.index) and finger.reference is None:
             reason = f"finger '{finger.name}' was started anew"
         if reason:
-            self._halt_goal(ServerGoalHandle.abort, failure(reason))
-        elif self.goal.is_cancel_requested:
-            self._halt_goal(ServerGoalHandle.canceled, failure("canceled"))
+            self.halt(reason)
         else:
             self._go_on(finger, motion)
 
@@ -243,8 +227,8 @@ class GripperNode(FingerNode):
             finger.follow(motion.depart(finger.index, finger.time, finger.place()))
         else:
             finger.extend()
-        opening, force = self._measured()
-        self.goal.publish_feedback(Grip.Feedback(opening=opening, force=force))
+        if self.asker is not None:
+            self.asker.feel(self.measured())
         states = [f.state for f in self.fingers]
         outcome = motion.decide(
             [f.time for f in self.fingers],
@@ -252,66 +236,50 @@ class GripperNode(FingerNode):
             [s.tip_force for s in states],
         )
         if outcome is not None:
-            end = ServerGoalHandle.succeed if outcome.success else ServerGoalHandle.abort
-            self._halt_goal(end, outcome)
+            self._halt_motion(outcome)
 
     def _watch(self) -> None:
         if self.motion is None:
             return
         for finger in self.fingers:
             if finger.problem():
-                self._halt_goal(ServerGoalHandle.abort, failure(finger.problem()))
+                self.halt(finger.problem())
                 return
-
-    def _measured(self) -> tuple[float, float]:
-        """Return opening (m) and force (N) as the newest states have them."""
-        states = [finger.state for finger in self.fingers]
-        opening = opening_of(self.parameters, [s.deflection for s in states])
-        return opening, force_of([s.tip_force for s in states])
 
     # --- ends ---------------------------------------------------------------------------------------
 
-    def _halt_goal(self, end: Callable[[ServerGoalHandle], None], outcome: Outcome) -> None:
-        """Hold the fingers where their references were at the newest states, and end the goal."""
+    def _halt_motion(self, outcome: Outcome) -> None:
+        """Hold the fingers where their references were at the newest states, and end the motion."""
         for finger in self.fingers:
             if finger.reference is not None:
                 finger.follow(hold(finger.place()))
-        self._finish(end, outcome)
+        self._finish(outcome)
 
-    def _give_up(self, handle: ServerGoalHandle) -> None:
-        """End the goal because the node stops."""
+    def _give_up(self, asker: Asker) -> None:
+        """End the motion because the node stops."""
 
         def ended() -> bool:
-            if handle is self.goal:
-                self._halt_goal(ServerGoalHandle.abort, failure("the gripper is stopped"))
-            return not handle.is_active
+            if self.asker is asker:
+                self.halt("the gripper is stopped")
+            return asker.is_told()
 
-        if self.executor is None:  # a signal has ended the loop; the client still needs its result
+        if self.executor is None:  # a signal has ended the loop; a client still needs its result
             spin.spin([self], ended)
         else:
             ended()
 
-    def _finish(self, end: Callable[[ServerGoalHandle], None], outcome: Outcome) -> None:
-        """Let the client know by `end`, in an event of its own."""
-        handle, self.goal, self.motion = self.goal, None, None
-        opening, force = self._measured()
-        result = Grip.Result(
-            opening=opening,
-            force=force,
-            reached_goal=outcome.reached_goal,
-            stalled=outcome.stalled,
-        )
-
-        def conclude(_: ServerGoalHandle) -> Grip.Result:
-            end(handle)
-            return result
-
-        self.server.notify_execute(handle, conclude)
-        text = f"goal {handle.request.opening * 1e6:g} µm: {outcome.text}"
+    def _finish(self, outcome: Outcome) -> None:
+        """End the motion, if there is one, and tell whose it was."""
+        motion, asker = self.motion, self.asker
+        self.motion = self.asker = None
+        if motion is None or asker is None:
+            return
+        text = f"goal {motion.goal.opening * 1e6:g} µm: {outcome.text}"
         if outcome.success:
             self.get_logger().info(text)
         else:
             self.get_logger().warning(text)
+        asker.end(outcome, self.measured())
 
 
 def failure(text: str) -> Outcome:
