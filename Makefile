@@ -40,7 +40,7 @@ bench: env
 	$(RUN) python bench/run.py --out out/bench.json
 
 test: lint
-	$(RUN) python -m pytest
+	$(RUN) python -m pytest -n 2 --dist loadfile
 
 lint: env
 	$(RUN) ruff check . && ruff format --check . && mypy

@@ -65,6 +65,7 @@ ROSDEP_KEYS = {
     "python3-numpy",
     "python3-pandas",
     "python3-pytest",
+    "python3-pytest-xdist",
     "python3-rich",
     "python3-rosbags-pip",
     "python3-ruff-pip",
