@@ -7,7 +7,7 @@ Positive deflections close. Each finger's reference goes from where it is to (re
 on a straight line, at half the speed wanted of the opening. Lines are profiles in the finger's own time,
 its sample number times the sample time: running free that is the wall clock, in lock-step the simulated
 one, which passes at whatever speed the machine manages. So the speed holds in both, to the sample, and no
-message has to be in time.
+message has to be in time. A trajectory of openings is the same with more than one line.
 
 The force is the larger of the two pushes that bend the tips open, -tip_force. It ends closing motions;
 opening relieves it.
@@ -71,12 +71,23 @@ class GripperParameters:
             )
 
 
+class Waypoint(NamedTuple):
+    """An opening (m) and its time (s) after the departure."""
+
+    time: float
+    opening: float
+
+
 class Goal(NamedTuple):
-    """What is wanted: opening (m), the force that ends a closing motion (N), speed of the opening (m/s)."""
+    """What is wanted: opening (m), the force that ends a closing motion (N), speed of the opening (m/s).
+
+    With waypoints these make the speed, and `opening` is that of the last one.
+    """
 
     opening: float
     max_force: float
     speed: float
+    waypoints: tuple[Waypoint, ...] = ()
 
 
 class Outcome(NamedTuple):
@@ -88,6 +99,14 @@ class Outcome(NamedTuple):
     text: str
 
 
+def reach(parameters: GripperParameters) -> tuple[float, float]:
+    """Return the narrowest and the widest opening (m)."""
+    p = parameters
+    # rounded to the picometre, so that a bound that somebody types is inside
+    narrowest = round(p.rest_opening - 2.0 * p.deflection_high, 12)
+    return narrowest, round(p.rest_opening - 2.0 * p.deflection_low, 12)
+
+
 def check_goal(
     parameters: GripperParameters, opening: float, max_force: float, speed: float
 ) -> Goal:
@@ -97,9 +116,7 @@ def check_goal(
     """
     p = parameters
     goal = Goal(opening, max_force or p.force_limit, speed or p.speed)
-    # rounded to the picometre, so that a bound that somebody types is inside
-    narrowest = round(p.rest_opening - 2.0 * p.deflection_high, 12)
-    widest = round(p.rest_opening - 2.0 * p.deflection_low, 12)
+    narrowest, widest = reach(p)
     for name, low, high, unit in (
         ("opening", narrowest, widest, "m"),
         ("max_force", SMALLEST, p.force_limit, "N"),
@@ -109,6 +126,41 @@ def check_goal(
         if not low <= value <= high:
             raise ValueError(f"{name} is {value:g}, must be in [{low:g}, {high:g}] {unit}")
     return goal
+
+
+def check_trajectory(
+    parameters: GripperParameters, waypoints: Sequence[Waypoint], opening: float
+) -> Goal:
+    """Return the goal that follows `waypoints` from `opening` (m), with the force limit.
+
+    Raises ValueError naming the waypoint, its value and the allowed range.
+    """
+    p = parameters
+    narrowest, widest = reach(p)
+    before = Waypoint(0.0, opening)
+    for number, waypoint in enumerate(waypoints):
+        if not narrowest <= waypoint.opening <= widest:
+            raise ValueError(
+                f"waypoint {number}: opening is {waypoint.opening:g}, must be in "
+                f"[{narrowest:g}, {widest:g}] m"
+            )
+        way, duration = abs(waypoint.opening - before.opening), waypoint.time - before.time
+        if waypoint.time == 0.0 and number == 0 and way <= p.tolerance:
+            continue  # it says where the gripper is
+        if not duration >= p.sample_time:
+            raise ValueError(
+                f"waypoint {number} is at {waypoint.time:g} s, must be {p.sample_time:g} s or more "
+                f"after {before.time:g} s"
+            )
+        if way > p.speed_limit * duration:
+            raise ValueError(
+                f"waypoint {number}: speed is {way / duration:g}, must be at most {p.speed_limit:g} m/s"
+            )
+        before = waypoint
+    if before.time == 0.0:
+        raise ValueError("the trajectory has no waypoint after its start")
+    way_ahead = tuple(waypoint for waypoint in waypoints if waypoint.time > 0.0)
+    return Goal(before.opening, p.force_limit, p.speed_limit, way_ahead)
 
 
 def opening_of(parameters: GripperParameters, deflections: Sequence[float]) -> float:
@@ -140,8 +192,8 @@ class Motion:
     ) -> None:
         self.goal = goal
         self._parameters = parameters
-        self._target = (parameters.rest_opening - goal.opening) / 2.0
-        self._closing = self._target > min(references)
+        openings = [waypoint.opening for waypoint in goal.waypoints] or [goal.opening]
+        self._closing = max(map(self._reference, openings)) > min(references)
         self._arrivals = [math.inf] * len(references)
 
     def departed(self, finger: int) -> bool:
@@ -149,12 +201,20 @@ class Motion:
         return math.isfinite(self._arrivals[finger])
 
     def depart(self, finger: int, time: float, reference: float) -> Profile:
-        """Return the line for a finger whose reference is `reference` (m) at its time `time` (s)."""
-        duration = abs(self._target - reference) / (self.goal.speed / 2.0)
-        self._arrivals[finger] = time + duration
+        """Return the lines for a finger whose reference is `reference` (m) at its time `time` (s)."""
+        target = self._reference(self.goal.opening)
+        straight = Waypoint(abs(target - reference) / (self.goal.speed / 2.0), self.goal.opening)
+        way = self.goal.waypoints or (straight,)
+        self._arrivals[finger] = time + way[-1].time
         if self._arrivals[finger] == time:
-            return hold(self._target)
-        return Profile([time, time + duration], [reference, self._target], linear=True)
+            return hold(target)
+        instants = [time, *(time + waypoint.time for waypoint in way)]
+        values = [reference, *(self._reference(waypoint.opening) for waypoint in way)]
+        return Profile(instants, values, linear=True)
+
+    def _reference(self, opening: float) -> float:
+        """Return the reference (m) of either finger at an opening (m)."""
+        return (self._parameters.rest_opening - opening) / 2.0
 
     def decide(
         self, times: Sequence[float], deflections: Sequence[float], tip_forces: Sequence[float]

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -220,10 +221,11 @@ class Bench:
         return [r[-1].value[0] for r in self.references.values()]
 
 
-@pytest.fixture
-def bench(tmp_path):
+@contextmanager
+def started(folder):
+    """Give a bench whose gripper has met its fingers, and see to it that all ends well."""
     rclpy.init()
-    bench = Bench(tmp_path)
+    bench = Bench(folder)
     try:
         bench.wait(lambda: len(bench.states) == 2 and bench.client.server_is_ready())
         bench.wait(lambda: all(s.phase == FingerState.RUNNING for s in bench.states.values()))
@@ -234,6 +236,12 @@ def bench(tmp_path):
         codes = bench.close()
         rclpy.shutdown()
     assert all(code in (0, -signal.SIGKILL) for code in codes)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with started(tmp_path) as bench:
+        yield bench
 
 
 SLOW = 0.5e-6  # m/s: any way lasts for the whole test

@@ -24,7 +24,7 @@ LEVELS = [
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}
 ROS = {
     "rclpy", "ament_index_python", "rcl_interfaces", "lifecycle_msgs", "piezo_gripper_msgs",
-    "rosgraph_msgs", "sensor_msgs", "std_msgs", "launch", "launch_ros",
+    "rosgraph_msgs", "sensor_msgs", "std_msgs", "trajectory_msgs", "control_msgs", "launch", "launch_ros",
 }  # fmt: skip
 
 MODULES = sorted(

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two fingers behind the action `grip`: bring them to an opening, or stop at a force.
+"""Two fingers as one gripper: bring them to an opening, or stop at a force.
 
-action: grip (Grip: opening m, max_force N, speed m/s)
-in:     FINGER/state (FingerState) of both fingers
-out:    FINGER/reference_profile (Profile, m) of both fingers
+action:   grip (Grip: opening m, max_force N, speed m/s)
+in:       FINGER/state (FingerState) of both fingers, ~/joint_commands (sensor_msgs/JointState),
+          ~/joint_trajectory (trajectory_msgs/JointTrajectory)
+out:      FINGER/reference_profile (Profile, m) of both fingers, joint_states (sensor_msgs/JointState)
+services: ~/home, ~/release, ~/stop, ~/zero, ~/reset (std_srvs/Trigger)
 
 One goal at a time; a new one takes over from the moving fingers, and the old one is aborted. A goal
 ends when the opening is reached or, closing, when the force is: both are successes. What the action's
@@ -15,18 +17,24 @@ it holds, and never moves on. A finger that stops by itself is at 0 V, and is to
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from time import monotonic
 from typing import Any
 
+from rclpy.client import Client
 from rclpy.duration import Duration
+from rclpy.task import Future
+from std_srvs.srv import Trigger
 
 from piezo_control.gripper import (
     Goal,
     GripperParameters,
     Motion,
     Outcome,
+    Waypoint,
     check_goal,
+    check_trajectory,
     force_of,
     hold,
     opening_of,
@@ -36,6 +44,9 @@ from piezo_control.nodes import spin
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.faces.actions import GripFace
 from piezo_control.nodes.faces.asker import Asker, Measured
+from piezo_control.nodes.faces.joint_commands import JointCommands
+from piezo_control.nodes.faces.joint_states import JointStates
+from piezo_control.nodes.faces.services import Services
 from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.parameters import ParameterError, parameter
@@ -45,6 +56,7 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 WATCH_PERIOD = 0.1  # s
 DELIVERY_TIMEOUT = Duration(seconds=0.5)
+VELOCITY_WINDOW = 0.1  # s of the finger's time: the sensor's quantum of 10 nm is 0.1 µm/s then
 LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second
 PHASES = {
     FingerState.IDLE: "IDLE",
@@ -62,6 +74,17 @@ class GripperNodeParameters(GripperParameters):
     fingers: tuple[str, ...] = parameter(
         ("left", "right"), "namespaces of the two fingers, relative to the gripper's"
     )
+    joint: str = parameter("gripper_joint", "name of the joint whose position is the opening")
+    finger_joints: tuple[str, ...] = parameter(
+        ("left_finger_joint", "right_finger_joint"),
+        "names of the joints whose positions are the fingers' deflections",
+    )
+    joint_state_rate: float = parameter(
+        100.0, "how often `joint_states` is published", unit="Hz", low=1.0, high=1000.0
+    )
+    zero_limit: float = parameter(
+        2e-6, "largest deflection that `~/zero` takes for 0", unit="m", low=0.0, high=1e-4
+    )
     state_timeout: float = parameter(
         1.0, "a finger whose state is older is taken for dead (wall clock)", unit="s", low=0.2,
         high=60.0,
@@ -71,6 +94,11 @@ class GripperNodeParameters(GripperParameters):
         super().__post_init__()
         if len(set(self.fingers)) != 2 or len(self.fingers) != 2:
             raise ParameterError(f"'fingers' is {list(self.fingers)}, must be two different names")
+        joints = [self.joint, *self.finger_joints]
+        if len(set(joints)) != 3 or len(joints) != 3 or "" in joints:
+            raise ParameterError(
+                f"'joint' and 'finger_joints' are {joints}, must be three different names"
+            )
 
 
 class Finger:
@@ -85,7 +113,11 @@ class Finger:
         self.index = index
         self.state: Any = None  # FingerState; None before the first
         self.reference: Profile | None = None
+        self.zero = 0.0  # m, the deflection at which the finger is at rest
         self.heard = monotonic()
+        self._way: deque[tuple[float, float]] = (
+            deque()
+        )  # time (s) and deflection (m), the last ones
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
         self._states = node.create_subscription(FingerState, f"{name}/state", self._take, LATCHED)
 
@@ -94,15 +126,31 @@ class Finger:
         """The finger's own time: s since its sample 0."""
         return self.state.samples * self._node.parameters.sample_time
 
+    @property
+    def deflection(self) -> float:
+        """Where the finger is (m)."""
+        return self.state.deflection - self.zero
+
+    @property
+    def velocity(self) -> float:
+        """How fast the finger went (m/s) over the last `VELOCITY_WINDOW`."""
+        (begin, start), (end, here) = self._way[0], self._way[-1]
+        return (here - start) / (end - begin) if end > begin else 0.0
+
+    @property
+    def push(self) -> float:
+        """Force of the object on the tip (N), positive where it bends the finger open."""
+        return -self.state.tip_force
+
     def place(self) -> float:
         """Return where the reference is (m); before the first one, where the finger is."""
         if self.reference is None:
-            return self.state.deflection
-        return float(self.reference.at(self.time))
+            return self.deflection
+        return float(self.reference.at(self.time)) - self.zero
 
     def follow(self, reference: Profile) -> None:
         """Give the finger this reference."""
-        self.reference = reference
+        self.reference = Profile(reference.time, reference.value + self.zero, reference.linear)
         self.extend()
 
     def extend(self) -> None:
@@ -117,16 +165,37 @@ class Finger:
             reference = reference.part(self.time, self.time + LEASE)
         self._profiles.publish(to_message(reference))
 
+    def silence(self) -> str:
+        """Return that the finger is taken for dead, or nothing."""
+        silence = monotonic() - self.heard
+        if self.state is not None and silence <= self._node.parameters.state_timeout:
+            return ""
+        topic = self._node.resolve_topic_name(f"{self.name}/state")
+        return f"finger '{self.name}' is silent: nothing on '{topic}' for {silence:.1f} s"
+
     def problem(self) -> str:
         """Return why the finger cannot move, or nothing."""
-        silence = monotonic() - self.heard
-        if self.state is None or silence > self._node.parameters.state_timeout:
-            topic = self._node.resolve_topic_name(f"{self.name}/state")
-            return f"finger '{self.name}' is silent: nothing on '{topic}' for {silence:.1f} s"
+        if silence := self.silence():
+            return silence
         if self.state.phase != FingerState.RUNNING:
             text = f" ({self.state.text})" if self.state.text else ""
             return f"finger '{self.name}' is {PHASES[self.state.phase]}{text}, must be RUNNING"
         return ""
+
+    def reset(self) -> None:
+        """Ask all nodes of the finger to leave their faults; what one of them refuses is logged."""
+        logger = self._node.get_logger()
+        folder = self._node.resolve_topic_name(self.name)
+        for name, _ in self._node.get_service_names_and_types():
+            if name.startswith(f"{folder}/") and name.endswith("/reset"):
+                client = self._node.create_client(Trigger, name)
+
+                def tell(answer: Future, name: str = name, client: Client = client) -> None:
+                    if not answer.result().success:
+                        logger.error(f"'{name}': {answer.result().message}")
+                    self._node.destroy_client(client)
+
+                client.call_async(Trigger.Request()).add_done_callback(tell)
 
     def release(self) -> None:
         """Make sure the last reference has arrived, then let go of the topics."""
@@ -138,6 +207,12 @@ class Finger:
         restarted = self.state is not None and state.samples < self.state.samples
         self.state = state
         self.heard = monotonic()
+        if restarted:
+            self._way.clear()
+        if not self._way or self.time > self._way[-1][0]:
+            self._way.append((self.time, state.deflection))
+        while len(self._way) > 2 and self.time - self._way[1][0] >= VELOCITY_WINDOW:
+            self._way.popleft()
         if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
             self.follow(hold(0.0))
             self.reference = None
@@ -154,11 +229,12 @@ class GripperNode(FingerNode):
         self.motion: Motion | None = None
         self.asker: Asker | None = None  # whose motion it is
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
-        self.faces = [GripFace(self, "grip")]
+        self.actions = [GripFace(self, "grip")]  # there when inactive too, to refuse
+        self.faces: list[JointStates | JointCommands | Services] = []
 
     def destroy_node(self) -> None:
-        for face in self.faces:
-            face.destroy()
+        for action in self.actions:
+            action.destroy()
         super().destroy_node()
 
     def start(self) -> None:
@@ -166,6 +242,7 @@ class GripperNode(FingerNode):
             Finger(self, name, index, self._on_state)
             for index, name in enumerate(self.parameters.fingers)
         ]
+        self.faces = [JointStates(self), JointCommands(self), Services(self)]
         self.watchdog.reset()
 
     def stop(self) -> None:
@@ -173,9 +250,24 @@ class GripperNode(FingerNode):
         self.active = False  # no goal from here on
         if self.asker is not None:
             self._give_up(self.asker)
+        for face in self.faces:
+            face.destroy()
         for finger in self.fingers:
             finger.release()
         self.fingers = []
+
+    def reset(self) -> None:
+        """Let both fingers leave their faults."""
+        for finger in self.fingers:
+            finger.reset()
+
+    def report(self) -> tuple[str, dict[str, Any]]:
+        problems = [finger.problem() for finger in self.fingers]
+        figures: dict[str, Any] = {"moving": self.motion is not None}
+        if self.fingers and not any(finger.silence() for finger in self.fingers):
+            measured = self.measured()
+            figures |= {"opening [m]": measured.opening, "force [N]": measured.force}
+        return "; ".join(filter(None, problems)), figures
 
     # --- what the faces use -------------------------------------------------------------------------
 
@@ -184,10 +276,14 @@ class GripperNode(FingerNode):
         if not self.active:
             raise ValueError("the gripper is not active")
         goal = check_goal(self.parameters, opening, max_force, speed)
-        for finger in self.fingers:
-            if finger.problem():
-                raise ValueError(finger.problem())
+        self._check_fingers()
         return goal
+
+    def check_trajectory(self, waypoints: Sequence[Waypoint]) -> Goal:
+        """Return the goal that begins now; a ValueError says why the gripper cannot go for it."""
+        self._check_fingers()
+        here = opening_of(self.parameters, [finger.place() for finger in self.fingers])
+        return check_trajectory(self.parameters, waypoints, here)
 
     def move(self, goal: Goal, asker: Asker) -> None:
         """Go for a goal from where the fingers are; whoever else asked for a motion is told so."""
@@ -200,13 +296,36 @@ class GripperNode(FingerNode):
         """Hold the fingers where they are; a motion ends because of `reason`."""
         self._halt_motion(failure(reason))
 
+    def zero(self) -> str:
+        """Take the fingers' present deflections for 0 and say so; a ValueError says why that cannot be."""
+        if self.motion is not None:
+            raise ValueError("the gripper is moving: stop it first")
+        self._check_fingers()
+        limit = self.parameters.zero_limit
+        for finger in self.fingers:
+            if not abs(finger.state.deflection) <= limit:
+                raise ValueError(
+                    f"finger '{finger.name}' is at {finger.state.deflection * 1e6:.3f} µm of its sensor, "
+                    f"must be within ±{limit * 1e6:g} µm ('zero_limit')"
+                )
+        for finger in self.fingers:
+            finger.zero = finger.state.deflection
+        found = ", ".join(f"'{f.name}' at {f.zero * 1e6:.3f} µm" for f in self.fingers)
+        return f"zero is now: {found} of the sensors"
+
     def measured(self) -> Measured:
         """Return what the newest states say."""
-        states = [finger.state for finger in self.fingers]
         return Measured(
-            opening_of(self.parameters, [s.deflection for s in states]),
-            force_of([s.tip_force for s in states]),
+            opening_of(self.parameters, [finger.deflection for finger in self.fingers]),
+            -sum(finger.velocity for finger in self.fingers),
+            force_of([finger.state.tip_force for finger in self.fingers]),
         )
+
+    def _check_fingers(self) -> None:
+        """Raise ValueError if a finger cannot move."""
+        for finger in self.fingers:
+            if problem := finger.problem():
+                raise ValueError(problem)
 
     # --- the motion, moved on by the fingers' states ------------------------------------------------
 
@@ -229,11 +348,10 @@ class GripperNode(FingerNode):
             finger.extend()
         if self.asker is not None:
             self.asker.feel(self.measured())
-        states = [f.state for f in self.fingers]
         outcome = motion.decide(
             [f.time for f in self.fingers],
-            [s.deflection for s in states],
-            [s.tip_force for s in states],
+            [f.deflection for f in self.fingers],
+            [f.state.tip_force for f in self.fingers],
         )
         if outcome is not None:
             self._halt_motion(outcome)

@@ -12,6 +12,9 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 # Set-points: reliable, only the newest counts.
 SETPOINT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
+# What others draw, record or control by: as ros2_control's own broadcasters have it.
+STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+
 # Profiles and states: the newest is kept for those who join later.
 LATCHED = QoSProfile(
     depth=1,

@@ -12,6 +12,7 @@ class Measured(NamedTuple):
     """The gripper as the newest states of its fingers have it."""
 
     opening: float  # m
+    velocity: float  # m/s
     force: float  # N, the larger push
 
 
