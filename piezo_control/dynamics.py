@@ -7,6 +7,11 @@ are summed into one static target ahead of it. The target is constant within a s
     x(t+h) = x* + xx (x - x*) + xv v,        v(t+h) = vx (x - x*) + vv v
 
 is the exact solution at any sample time h, whatever the damping.
+
+Higher bending modes, where a finger has any, stand beside the paper's one with a share of the static
+deflection each, of either sign (the sign of their shape at the tip):
+
+    D(s) = (1 - sum_i share_i) / (a2 s² + a1 s + 1) + sum_i share_i / (s²/w_i² + 2 zeta_i s/w_i + 1)
 """
 
 from __future__ import annotations
@@ -34,6 +39,29 @@ class DynamicsParameters:
         if len(self.denominator) != 3 or self.denominator[2] != 1.0 or min(self.denominator) <= 0:
             raise ParameterError(
                 f"'denominator' is {self.denominator}, must be three positive numbers, the last 1.0"
+            )
+
+
+@dataclass(frozen=True)
+class ModesParameters:
+    """Higher bending modes beside that of the denominator; arrays of equal length, empty: none."""
+
+    frequency_hz: tuple[float, ...] = parameter((), "natural frequencies", unit="Hz", low=1.0)
+    damping: tuple[float, ...] = parameter((), "damping ratios", low=1e-4, high=1.0)
+    share: tuple[float, ...] = parameter(
+        (), "parts of the static deflection, of either sign", low=-0.9, high=0.9
+    )
+
+    def __post_init__(self) -> None:
+        lengths = [len(self.frequency_hz), len(self.damping), len(self.share)]
+        if len(set(lengths)) > 1:
+            raise ParameterError(
+                f"'frequency_hz', 'damping' and 'share' of the modes have {lengths[0]}, {lengths[1]} and "
+                f"{lengths[2]} elements, must have equally many"
+            )
+        if sum(self.share) >= 1.0:
+            raise ParameterError(
+                f"'share' is {list(self.share)}, must leave something to the first mode: a sum below 1"
             )
 
 
@@ -71,15 +99,15 @@ def propagator(inertia: float, damping: float, stiffness: float, time: float) ->
 
 
 class Motion(NamedTuple):
-    """Position (m) and speed (m/s) behind D(s), changed in place: lists of one (or float64 arrays)."""
+    """Position (m) and speed (m/s) of every mode, changed in place: lists (or float64 arrays)."""
 
     x: list[float]
     v: list[float]
 
 
-def move(motion: Motion, free: Propagator, target: float) -> None:
-    """Advance `motion` by one step towards the static `target` (m)."""
-    x = motion.x[0] - target
-    v = motion.v[0]
-    motion.x[0] = target + (free.xx * x + free.xv * v)
-    motion.v[0] = free.vx * x + free.vv * v
+def move(motion: Motion, free: Propagator, target: float, mode: int = 0) -> None:
+    """Advance one mode of `motion` by one step towards the static `target` (m)."""
+    x = motion.x[mode] - target
+    v = motion.v[mode]
+    motion.x[mode] = target + (free.xx * x + free.xv * v)
+    motion.v[mode] = free.vx * x + free.vv * v

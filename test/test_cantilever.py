@@ -6,10 +6,13 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import cont2discrete, lfilter
 
 from piezo_control.creep import CreepParameters
-from piezo_control.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters, ModesParameters
 from piezo_control.hysteresis import Hysteresis
+from piezo_control.parameters import ParameterError, build, load
+from piezo_control.shared import shared_folder
 from piezo_control.thermal import ThermalParameters
 from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
@@ -68,6 +71,51 @@ def test_equation_3_against_an_integration():
     # All is exact but the creep's gain, which follows the body half a sample late:
     # h / 2 * warming * gain_per_degc * U * sum(shares / times) = 5e-5 * 1.2 * 1.2e-8 * 20 * 0.125 m.
     np.testing.assert_allclose(got, expected, rtol=0.0, atol=3e-12)
+
+
+def test_a_second_mode_and_the_amplifier_s_lag_against_scipy():
+    """delta = H_s(U) ((1 - s) D_1 + s D_2) behind the lag, every mode sampled by scipy's exact hold."""
+    shipped = load(
+        shared_folder() / "params" / "finger_second_mode" / "cantilever.yaml", "cantilever"
+    )
+    parameters = build(CantileverParameters, shipped, "shipped")
+    modes, h = parameters.modes, parameters.sample_time
+    assert (modes.frequency_hz, modes.damping, modes.share) == ((4178.0,), (0.017,), (0.08,))
+    perfect = dataclasses.replace(
+        parameters,
+        sensor=PERFECT,
+        creep=CreepParameters(gain=0.0),
+        amplifier=dataclasses.replace(parameters.amplifier, slew_limit=1e9),
+    )
+    demand = np.repeat([30.0, -20.0, 10.0], 150)
+    got = run(Cantilever(perfect), demand, 22.0)
+    left = np.exp(-2.0 * np.pi * 10000.0 * h)
+    voltage = lfilter([1.0 - left], [1.0, -left], demand)
+    static = Hysteresis(parameters.hysteresis)
+    target = [static.step(float(v)) for v in voltage]
+    w = 2.0 * np.pi * 4178.0
+    expected = np.zeros(len(demand) + 1)
+    for share, denominator in (
+        (0.92, DynamicsParameters().denominator),
+        (0.08, (1.0 / w**2, 0.034 / w, 1.0)),
+    ):
+        numerator, sampled, _ = cont2discrete(([share], denominator), h, "zoh")
+        expected += lfilter(numerator[0], sampled, [*target, 0.0])
+    np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-12)
+    one_mode = run(Cantilever(dataclasses.replace(perfect, modes=ModesParameters())), demand, 22.0)
+    assert np.max(np.abs(one_mode - got)) > 1e-6
+
+
+@pytest.mark.parametrize(
+    "values, told",
+    [
+        ({"share": (0.1,)}, "0, 0 and 1 elements, must have equally many"),
+        ({"frequency_hz": (4e3, 9e3), "damping": (0.1, 0.1), "share": (0.6, 0.6)}, "a sum below 1"),
+    ],
+)
+def test_modes_that_make_no_finger_are_refused(values, told):
+    with pytest.raises(ParameterError, match=told):
+        ModesParameters(**values)
 
 
 def test_first_reading_is_zero_and_rest_stays_at_rest_at_any_temperature():

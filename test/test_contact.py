@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from piezo_control.dynamics import DynamicsParameters, Motion
+from piezo_control.dynamics import DynamicsParameters, ModesParameters, Motion
 from piezo_sim.plant.contact import ContactParameters, contact_force, discretize, move_tip
 
 DYNAMICS = DynamicsParameters()
@@ -14,7 +14,7 @@ SOFTNESS = DYNAMICS.elastic_constant
 
 
 def simulate(contact, target, offset, samples, sample_time):
-    tip = discretize(contact, DYNAMICS, sample_time)
+    tip = discretize(contact, DYNAMICS, ModesParameters(), sample_time)
     motion = Motion([0.0], [0.0])
     path = []
     for _ in range(samples):
@@ -72,6 +72,31 @@ def test_a_stiff_object_feeds_no_energy_into_the_tip(sample_time):
     at_rest = 0.5 * (20e-6) ** 2
     assert np.max(energy) < 1.05 * at_rest
     assert energy[-1] < np.min(energy[:20])
+
+
+def test_a_higher_mode_touches_too_and_its_object_acts_on_the_first_mode():
+    """Against an integration of both modes: the object sees their sum and pushes the first one."""
+    share, omega, zeta = -0.2, 2.0 * np.pi * 2500.0, 0.05
+    modes = ModesParameters(frequency_hz=(omega / (2.0 * np.pi),), damping=(zeta,), share=(share,))
+    contact = ContactParameters(stiffness=300.0, free_play=4e-6)
+    tip = discretize(contact, DYNAMICS, modes, 1e-5)
+    motion = Motion([0.0, 0.0], [0.0, 0.0])
+    got = []
+    for _ in range(300):
+        move_tip(motion, tip, 5e-6, 0.0)
+        got.append(sum(motion.x))
+
+    def law(_, y):
+        x, v, z, w = y
+        pull = SOFTNESS * -300.0 * max(x + z - 4.0, 0.0)
+        first = ((1.0 - share) * 5.0 + pull - A1 * v - x) / A2
+        return [v, first, w, omega**2 * (share * 5.0 - z) - 2.0 * zeta * omega * w]
+
+    time = np.arange(1, 301) * 1e-5
+    exact = solve_ivp(law, (0.0, 3e-3), np.zeros(4), t_eval=time, rtol=1e-9, max_step=2e-6).y
+    free = simulate(ContactParameters(), 5e-6, 0.0, 300, 1e-5)[1][:, 0]
+    assert np.max(np.abs(free - exact[0] * 1e-6)) > 1e-6  # the object and the share do matter
+    np.testing.assert_allclose(got, (exact[0] + exact[2]) * 1e-6, rtol=0.0, atol=5e-9)
 
 
 def test_the_object_only_pushes():

@@ -15,11 +15,15 @@ from piezo_control.design.linear_loop import (
     finger_response,
     fingers,
     margins,
+    noise_gain,
+    open_loop,
     respond,
     settling,
     spectral_radius,
     static_gain,
 )
+from piezo_control.design.problem import FingerModel
+from piezo_control.dynamics import ModesParameters
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.metrics import settling_time
 from piezo_control.parameters import build, load
@@ -37,7 +41,7 @@ def robust() -> FeedbackParameters:
     "damping", [1.0, 1.0 / 0.01696, 100.0], ids=["ringing", "critical", "slow"]
 )
 def test_finger_is_the_exact_hold_equivalent(damping):
-    box = fingers(DENOMINATOR, STEP, 2, resonance=[0.9], damping=[damping], gain=[1.1])
+    box = fingers(FingerModel(delay_samples=2), resonance=[0.9], damping=[damping], gain=[1.1])
     a2, a1, _ = DENOMINATOR
     numerator, denominator, _ = scipy.signal.cont2discrete(
         ([1.1], [a2 / 0.9**2, a1 * damping / 0.9, 1.0]), STEP, "zoh"
@@ -47,11 +51,66 @@ def test_finger_is_the_exact_hold_equivalent(damping):
     np.testing.assert_allclose(finger_response(box, z)[0], expected, rtol=1e-6)
 
 
+def test_modes_and_amplifier_against_scipy():
+    """(1 - s) D_1 + s_2 D_2 + s_3 D_3, sampled as one transfer function, behind a first-order lag."""
+    model = FingerModel(
+        modes=ModesParameters(frequency_hz=(4178.0,), damping=(0.017,), share=(0.08,)),
+        amplifier_bandwidth_hz=3000.0,
+        delay_samples=3,
+    )
+    beside = [
+        ModesParameters(frequency_hz=(2500.0,), damping=(0.02,), share=(share,))
+        for share in (-0.1, 0.1)
+    ]
+    box = fingers(model, gain=[0.9], beside=beside)
+    z = np.exp(1j * np.linspace(1.0, 0.99 * math.pi / STEP, 60) * STEP)
+    left = math.exp(-2.0 * math.pi * 3000.0 * STEP)
+    for i, share in enumerate((-0.1, 0.1)):
+        numerator, denominator = np.zeros(1), np.ones(1)
+        for part, hertz, zeta in (
+            (
+                1.0 - 0.08 - share,
+                1.0 / math.sqrt(5.7e-8) / 2.0 / math.pi,
+                8.1e-6 / 2.0 / math.sqrt(5.7e-8),
+            ),
+            (0.08, 4178.0, 0.017),
+            (share, 2500.0, 0.02),
+        ):
+            w = 2.0 * math.pi * hertz
+            mode = scipy.signal.cont2discrete(
+                ([part], [1.0 / w**2, 2.0 * zeta / w, 1.0]), STEP, "zoh"
+            )
+            numerator = np.polyadd(
+                np.polymul(numerator, mode[1]), np.polymul(mode[0][0], denominator)
+            )
+            denominator = np.polymul(denominator, mode[1])
+        expected = 0.9 * np.polyval(numerator, z) / np.polyval(denominator, z)
+        expected *= (1.0 - left) / (1.0 - left / z) / z**3
+        np.testing.assert_allclose(finger_response(box, z)[i], expected, rtol=1e-6)
+        way = open_loop(box)
+        for j in (0, 20, 59):
+            resolvent = np.linalg.solve(z[j] * np.eye(len(way.c)) - way.a[i], way.b[i])
+            assert way.c @ resolvent == pytest.approx(expected[j], rel=1e-6)
+
+
+def test_noise_gain_is_the_scatter_of_a_long_run():
+    controller = robust()
+    box = fingers(FingerModel(), gain=[1.1])
+    random = np.random.default_rng(1)
+    state, feedback, reading, found = np.zeros(2), Feedback(controller), 0.0, []
+    for noise in 1e-9 * random.standard_normal(20000):
+        found.append(feedback.step(0.0, reading + noise))
+        reading = state[0]
+        state = box.a[0, 0] @ state + box.b[0, 0] * found[-1]
+    expected = float(noise_gain(closed_loop(box, controller))[0])
+    assert np.std(found) * 1e9 == pytest.approx(expected, rel=0.03)
+
+
 @pytest.mark.parametrize("delay", [0, 1, 3])
 @pytest.mark.parametrize("source", ["reference", "force", "drift"])
 def test_responses_equal_the_laws_stepped_sample_by_sample(delay, source):
     controller = robust()
-    box = fingers(DENOMINATOR, STEP, delay, resonance=[0.9, 1.1], damping=[0.5], gain=[1.1])
+    box = fingers(FingerModel(delay_samples=delay), resonance=[0.9, 1.1], damping=[0.5], gain=[1.1])
     lag = 0.3 if source == "drift" else 0.0
     found = respond(closed_loop(box, controller), source, 120, lag, STEP)
     for i in range(2):
@@ -65,14 +124,14 @@ def test_responses_equal_the_laws_stepped_sample_by_sample(delay, source):
             assert found[i, k] == pytest.approx(readings[k] * 1e6, abs=1e-9)
             command = feedback.step(signal if source == "reference" else 0.0, readings[k])
             force = signal if source == "force" else 0.0
-            state = box.a[i] @ state + box.b[i] * command + box.b_force[i] * force
+            state = box.a[i, 0] @ state + box.b[i, 0] * command + box.b_force[i, 0] * force
 
 
 def test_poles_and_static_gain_equal_python_control():
     controller = robust()
-    box = fingers(DENOMINATOR, STEP, 1)
+    box = fingers(FingerModel())
     z = control.tf([1, 0], [0, 1], STEP)
-    g = control.ss(box.a[0], box.b[0][:, None], [[1, 0]], 0, STEP) * control.ss(1 / z)
+    g = control.ss(box.a[0, 0], box.b[0, 0][:, None], [[1, 0]], 0, STEP) * control.ss(1 / z)
     p = controller
     k = control.ss(p.matrix("a"), p.matrix("b")[:, None], [p.c], p.d, STEP)
     loop = closed_loop(box, controller)

@@ -171,9 +171,7 @@ def _sample_box(
     u = problem.uncertainty
     spread = u.resonance if spread is None else spread
     return fingers(
-        problem.finger.denominator,
-        problem.finger.sample_time,
-        problem.finger.delay_samples,
+        problem.finger,
         _around_one(1.0 - spread, 1.0 + spread, resonance),
         _around_one(u.damping_low, u.damping_high, damping),
         _around_one(u.gain_low, u.gain_high, gain),
@@ -207,7 +205,7 @@ def weighted_norms(problem: DesignProblem, controller: FeedbackParameters) -> di
     """
     names = ("performance", "performance_disturbance", "effort", "effort_disturbance", "all")
     model = problem.finger
-    nominal = fingers(model.denominator, model.sample_time, model.delay_samples)
+    nominal = fingers(model)
     if spectral_radius(closed_loop(nominal, controller))[0] >= 1.0:
         return dict.fromkeys(names, math.inf)
 
@@ -393,7 +391,7 @@ def nominal_figures(problem: DesignProblem, controller: FeedbackParameters) -> d
     of 0.005 and within 0.4 to 1.6.
     """
     model = problem.finger
-    nominal = fingers(model.denominator, model.sample_time, model.delay_samples)
+    nominal = fingers(model)
     omega = 1.0 / math.sqrt(model.denominator[0])
     frequency = frequency_grid(model.sample_time, 0.8 * omega, 1.2 * omega, 8000)
     z = np.exp(1j * frequency * model.sample_time)
@@ -430,7 +428,7 @@ def stable_resonances(
     """
     model = problem.finger
     factors = np.arange(80, 321) * 0.005
-    box = fingers(model.denominator, model.sample_time, model.delay_samples, resonance=factors)
+    box = fingers(model, resonance=factors)
     unstable = np.flatnonzero(spectral_radius(closed_loop(box, controller)) >= 1.0)
     centre = 120
     if centre in unstable:

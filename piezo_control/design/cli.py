@@ -88,7 +88,7 @@ def main() -> int:
 def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
     """Read a design problem; all that depends on the finger from `cantilever` when given.
 
-    That is D(s), sample time and sensor delay, the reach within the limits of the voltage, and how far a
+    That is D(s), higher modes, the amplifier's lag, sample time and sensor delay, the reach within the limits of the voltage, and how far a
     degree moves the tip: by the thermal deflection, and by the change of the stroke at the end of the reach.
 
     Raises ParameterError naming file and value.
@@ -98,6 +98,10 @@ def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
         identified = load(cantilever, "cantilever")
         names = {
             "dynamics.denominator": "finger.denominator",
+            "modes.frequency_hz": "finger.modes.frequency_hz",
+            "modes.damping": "finger.modes.damping",
+            "modes.share": "finger.modes.share",
+            "amplifier.bandwidth_hz": "finger.amplifier_bandwidth_hz",
             "sample_time": "finger.sample_time",
             "sensor.delay_samples": "finger.delay_samples",
             "thermal.time_constant": "finger.drift_time_constant",
@@ -234,8 +238,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--cantilever",
         type=Path,
-        help="parameter file of the cantilever, as `identify` writes it: its D(s), sample time, delay "
-        "and thermal lag instead of the problem's",
+        help="parameter file of the cantilever, as `identify` writes it: its D(s), modes, amplifier, sample "
+        "time, delay and thermal lag instead of the problem's",
     )
     parser.add_argument(
         "--force", action="store_true", help="write the controller though it is not certified"

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop without its nonlinearities: one discrete controller around a whole box of fingers.
 
-    finger:  gain D(s), D(s) = 1 / (a2 s² + a1 s + 1), sampled with a zero-order hold (exact)
+    finger:  gain D(s), every mode of it sampled with a zero-order hold (exact)
+    ahead:   the amplifier's lag, held from sample to sample like the voltage
     sensor:  `delay` whole samples
     control: the feedback law, within its limits
 
@@ -13,16 +14,26 @@ functions take many fingers at once; arrays have the finger first: (nfingers, nf
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from piezo_control.design.problem import FingerModel
+from piezo_control.dynamics import ModesParameters
 from piezo_control.feedback import FeedbackParameters
+
+COVARIANCE_DOUBLINGS = 20
+"""A million samples: what a pole at a modulus of 1 - 1e-5 needs to forget."""
 
 
 class Fingers(NamedTuple):
-    """Sampled fingers, states (x, x'/omega); every field has the finger first."""
+    """Sampled fingers; states (x, x'/omega) of every mode, the tip is the sum of all x.
+
+    `a` has shape (nfingers, nmodes, 2, 2), `b` and `b_force` (nfingers, nmodes, 2), the factors
+    (nfingers,). `lag` is the part of the amplifier's voltage that is left after a sample.
+    """
 
     a: np.ndarray
     b: np.ndarray
@@ -30,62 +41,88 @@ class Fingers(NamedTuple):
     resonance: np.ndarray
     damping: np.ndarray
     gain: np.ndarray
+    beside: tuple[ModesParameters, ...]
     sample_time: float
     delay: int
+    lag: float
 
 
 def fingers(
-    denominator: Sequence[float],
-    sample_time: float,
-    delay: int,
+    model: FingerModel,
     resonance: Sequence[float] = (1.0,),
     damping: Sequence[float] = (1.0,),
     gain: Sequence[float] = (1.0,),
+    beside: Sequence[ModesParameters] = (ModesParameters(),),
 ) -> Fingers:
     """Sample the fingers of a box, one for each combination of the factors.
 
     Parameters
     ----------
-    denominator : sequence of float
-        (a2, a1, 1) of the nominal D(s).
-    sample_time : float
-        In s.
-    delay : int
-        Samples between deflection and reading.
+    model : FingerModel
+        The nominal finger.
     resonance, damping, gain : sequence of float
-        Factors on natural frequency, damping ratio and static gain.
+        Factors on natural frequency and damping ratio of the first mode, and on the static gain.
+    beside : sequence of ModesParameters
+        Modes that nobody modelled, in addition to those of `model`; all equally many.
     """
-    factors = np.array(list(itertools.product(resonance, damping, gain)))
-    omega = factors[:, 0] / np.sqrt(denominator[0])
-    zeta = factors[:, 1] * denominator[1] / (2.0 * np.sqrt(denominator[0]))
+    h = model.sample_time
+    combinations = list(itertools.product(resonance, damping, gain, beside))
+    factors = np.array([combination[:3] for combination in combinations])
+    others = [
+        (
+            [2.0 * math.pi * f for f in (*model.modes.frequency_hz, *more.frequency_hz)],
+            [*model.modes.damping, *more.damping],
+            [*model.modes.share, *more.share],
+        )
+        for *_, more in combinations
+    ]
+    count = len(combinations)
+    omega = np.column_stack(
+        [
+            factors[:, 0] / np.sqrt(model.denominator[0]),
+            np.reshape([o[0] for o in others], (count, -1)),
+        ]
+    )
+    zeta = np.column_stack(
+        [
+            factors[:, 1] * model.denominator[1] / (2.0 * np.sqrt(model.denominator[0])),
+            np.reshape([o[1] for o in others], (count, -1)),
+        ]
+    )
+    higher = np.reshape([o[2] for o in others], (count, -1))
+    share = np.column_stack([1.0 - higher.sum(axis=1), higher])
     # Complex arithmetic covers overdamped fingers too.
     ringing = omega * np.emath.sqrt(1.0 - zeta**2)
-    envelope = np.exp(-zeta * omega * sample_time)
-    even = np.cos(ringing * sample_time).real
-    odd = (omega * sample_time * np.sinc(ringing * sample_time / np.pi)).real
-    a = envelope[:, None, None] * np.moveaxis(
-        np.array([[even + zeta * odd, odd], [-odd, even - zeta * odd]]), 2, 0
+    envelope = np.exp(-zeta * omega * h)
+    even = np.cos(ringing * h).real
+    odd = (omega * h * np.sinc(ringing * h / np.pi)).real
+    a = envelope[..., None, None] * np.moveaxis(
+        np.array([[even + zeta * odd, odd], [-odd, even - zeta * odd]]), (0, 1), (2, 3)
     )
-    b_force = (np.eye(2) - a)[:, :, 0]
+    b_force = share[..., None] * (np.eye(2) - a)[..., 0]
+    bandwidth = model.amplifier_bandwidth_hz
     return Fingers(
         a=a,
-        b=factors[:, 2:] * b_force,
+        b=factors[:, 2, None, None] * b_force,
         b_force=b_force,
         resonance=factors[:, 0],
         damping=factors[:, 1],
         gain=factors[:, 2],
-        sample_time=sample_time,
-        delay=delay,
+        beside=tuple(combination[3] for combination in combinations),
+        sample_time=h,
+        delay=model.delay_samples,
+        lag=math.exp(-2.0 * math.pi * bandwidth * h) if bandwidth else 0.0,
     )
 
 
 def finger_response(box: Fingers, z: np.ndarray) -> np.ndarray:
     """Return the response from command to reading at `z`, shape (nfingers, len(z))."""
-    trace = np.trace(box.a, axis1=1, axis2=2)[:, None]
-    determinant = np.linalg.det(box.a)[:, None]
-    constant = (box.a[:, 0, 1] * box.b[:, 1] - box.a[:, 1, 1] * box.b[:, 0])[:, None]
-    numerator = box.b[:, :1] * z + constant
-    return numerator / (z * z - trace * z + determinant) * z ** (-box.delay)
+    trace = np.trace(box.a, axis1=2, axis2=3)[..., None]
+    determinant = np.linalg.det(box.a)[..., None]
+    constant = (box.a[..., 0, 1] * box.b[..., 1] - box.a[..., 1, 1] * box.b[..., 0])[..., None]
+    modes = (box.b[..., :1] * z + constant) / (z * z - trace * z + determinant)
+    amplifier = (1.0 - box.lag) / (1.0 - box.lag / z)
+    return modes.sum(axis=1) * amplifier * z ** (-box.delay)
 
 
 def controller_response(parameters: FeedbackParameters, z: np.ndarray) -> np.ndarray:
@@ -97,46 +134,97 @@ def controller_response(parameters: FeedbackParameters, z: np.ndarray) -> np.nda
     return (p.matrix("c") @ states).T + np.array([[p.d], [p.reference_d]])
 
 
+class OpenLoop(NamedTuple):
+    """From command to reading: states (modes, amplifier, delayed readings), the finger's index first."""
+
+    a: np.ndarray
+    b: np.ndarray
+    b_force: np.ndarray
+    b_drift: np.ndarray
+    c: np.ndarray
+
+
+def open_loop(box: Fingers) -> OpenLoop:
+    """Put amplifier and sensor to every finger of `box`."""
+    number, modes = box.a.shape[:2]
+    own = 2 * modes
+    line = own + (box.lag > 0.0)  # the first of the delayed readings
+    size = line + box.delay
+    a = np.zeros((number, size, size))
+    b, b_force, b_drift = (np.zeros((number, size)) for _ in range(3))
+    tip, c = np.zeros(size), np.zeros(size)
+    tip[0:own:2] = 1.0
+    for i in range(modes):
+        a[:, 2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = box.a[:, i]
+    b[:, :own] = (1.0 - box.lag) * box.b.reshape(number, own)
+    b_force[:, :own] = box.b_force.reshape(number, own)
+    if box.lag:
+        a[:, :own, own] = box.lag * box.b.reshape(number, own)
+        a[:, own, own] = box.lag
+        b[:, own] = 1.0 - box.lag
+    if box.delay:
+        a[:, line] = tip
+        a[:, range(line + 1, size), range(line, size - 1)] = 1.0
+        b_drift[:, line] = 1.0
+        c[-1] = 1.0
+    else:
+        c = tip
+    return OpenLoop(a, b, b_force, b_drift, c)
+
+
 class ClosedLoop(NamedTuple):
-    """Closed loops, states (finger, delayed readings, controller); fields have the finger first."""
+    """Closed loops, states (open loop, controller), the finger's index first.
+
+    The command is c_command times the states, and `d_reference` times the reference.
+    """
 
     a: np.ndarray
     b_reference: np.ndarray
     b_force: np.ndarray
     b_drift: np.ndarray
-    reading: int
+    b_noise: np.ndarray
+    c_reading: np.ndarray
+    c_command: np.ndarray
+    d: float
+    d_reference: float
     delay: int
 
 
 def closed_loop(box: Fingers, parameters: FeedbackParameters) -> ClosedLoop:
     """Close the loop around every finger of `box`."""
     p = parameters
-    number, delay, order = len(box.a), box.delay, p.order
-    size = 2 + delay + order
-    controller = slice(2 + delay, size)
-    reading = 0 if delay == 0 else 1 + delay
+    way = open_loop(box)
+    number, first = way.b.shape
+    size = first + p.order
+    readings, states = slice(0, first), slice(first, size)
+    c_reading = np.concatenate([way.c, np.zeros(p.order)])
+    c_command = np.concatenate([-p.d * way.c, p.c])
+
+    def padded(b: np.ndarray) -> np.ndarray:
+        return np.hstack([b, np.zeros((number, p.order))])
+
+    b_command = padded(way.b)
     a = np.zeros((number, size, size))
-    a[:, :2, :2] = box.a
-    if delay:
-        a[:, 2, 0] = 1.0
-        a[:, range(3, 2 + delay), range(2, 1 + delay)] = 1.0
-    a[:, :2, controller] = box.b[:, :, None] * p.matrix("c")
-    a[:, :2, reading] -= box.b * p.d
-    a[:, controller, controller] = p.matrix("a")
-    a[:, controller, reading] -= p.matrix("b")
-    b_error = np.zeros((number, size))
-    b_error[:, :2] = box.b * p.d
-    b_error[:, controller] = p.matrix("b")
-    b_reference = b_error.copy()
-    b_reference[:, :2] += box.b * p.reference_d
-    b_reference[:, controller] += p.matrix("reference_b")
-    b_force = np.zeros((number, size))
-    b_force[:, :2] = box.b_force
-    b_drift = -b_error
-    if delay:
-        b_drift = np.zeros((number, size))
-        b_drift[:, 2] = 1.0
-    return ClosedLoop(a, b_reference, b_force, b_drift, reading, delay)
+    a[:, readings, readings] = way.a
+    a += b_command[:, :, None] * c_command
+    a[:, states, states] = p.matrix("a")
+    a[:, states, readings] = -p.matrix("b")[:, None] * way.c
+    b_error = b_command * p.d
+    b_error[:, states] = p.matrix("b")
+    b_reference = b_error + b_command * p.reference_d
+    b_reference[:, states] += p.matrix("reference_b")
+    return ClosedLoop(
+        a=a,
+        b_reference=b_reference,
+        b_force=padded(way.b_force),
+        b_drift=padded(way.b_drift) if box.delay else -b_error,
+        b_noise=-b_error,
+        c_reading=c_reading,
+        c_command=c_command,
+        d=p.d,
+        d_reference=p.d + p.reference_d,
+        delay=box.delay,
+    )
 
 
 def spectral_radius(loop: ClosedLoop) -> np.ndarray:
@@ -152,7 +240,23 @@ def respond(
     `source` is 'reference', 'force' (as the static deflection it would cause) or 'drift' (a
     deflection added to the tip's). With `lag` (s) the source is 1 - exp(-t / lag) instead of a step.
     """
-    b = getattr(loop, f"b_{source}")
+    states = _respond(loop, getattr(loop, f"b_{source}"), samples, lag, sample_time)
+    readings = np.einsum("i,nik->nk", loop.c_reading, states[:, :-2])
+    if source == "drift" and loop.delay == 0:
+        readings = readings + states[:, -2] - states[:, -1]
+    return readings
+
+
+def commands(loop: ClosedLoop, samples: int) -> np.ndarray:
+    """Return the commands after a unit step of the reference, from rest, shape (nfingers, samples)."""
+    states = _respond(loop, loop.b_reference, samples)
+    return np.einsum("i,nik->nk", loop.c_command, states[:, :-2]) + loop.d_reference
+
+
+def _respond(
+    loop: ClosedLoop, b: np.ndarray, samples: int, lag: float = 0.0, sample_time: float = 1.0
+) -> np.ndarray:
+    """Return the loop's states after a step through `b`, with step and lag as the last two."""
     number, size = b.shape
     # Step and lag become two more states; then powers of one matrix give the whole response, and
     # every pass doubles the number of known samples.
@@ -168,10 +272,24 @@ def respond(
     while states.shape[2] < samples:
         states = np.concatenate([states, power @ states], axis=2)
         power = power @ power
-    readings = states[:, loop.reading, :samples]
-    if source == "drift" and loop.delay == 0:
-        readings = readings + states[:, size, :samples] - states[:, size + 1, :samples]
-    return readings
+    return states[:, :, :samples]
+
+
+def noise_gain(loop: ClosedLoop) -> np.ndarray:
+    """Return the standard deviation of the command per one of white noise on the readings.
+
+    The H2 norm of K S, from the stationary covariance of the loop's states; infinite when unstable.
+    Shape (nfingers,).
+    """
+    covariance = loop.b_noise[:, :, None] * loop.b_noise[:, None, :]
+    power = loop.a
+    with np.errstate(over="ignore", invalid="ignore"):
+        # After n passes the covariance of 2^n samples of noise.
+        for _ in range(COVARIANCE_DOUBLINGS):
+            covariance = covariance + power @ covariance @ np.swapaxes(power, 1, 2)
+            power = power @ power
+        square = np.einsum("i,nij,j->n", loop.c_command, covariance, loop.c_command) + loop.d**2
+        return np.where(spectral_radius(loop) < 1.0, np.sqrt(square), np.inf)
 
 
 def settling(readings: np.ndarray, sample_time: float, target: float, band: float) -> np.ndarray:
@@ -197,7 +315,7 @@ def static_gain(loop: ClosedLoop) -> np.ndarray:
     """Return the reading per reference at rest, for each finger."""
     size = loop.a.shape[1]
     rest = np.linalg.solve(np.eye(size) - loop.a, loop.b_reference[:, :, None])
-    return rest[:, loop.reading, 0]
+    return rest[:, :, 0] @ loop.c_reading
 
 
 def frequency_grid(

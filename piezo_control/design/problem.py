@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from piezo_control.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters, ModesParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError, group, parameter
 
@@ -19,14 +19,22 @@ METHODS = ("hinf", "given", "pid", "integrator_notch")
 
 @dataclass(frozen=True)
 class FingerModel:
-    """The linear finger: D(s), sensor delay, reachable range and slow disturbances."""
+    """The linear finger: D(s), amplifier, sensor delay, reachable range and slow disturbances."""
 
     denominator: tuple[float, ...] = parameter(
         DynamicsParameters().denominator,
         "denominator of D(s), highest power first; D(0) = 1",
         low=0.0,
     )
+    modes: ModesParameters = group(ModesParameters)
     sample_time: float = parameter(1e-4, "sample time of the loop", unit="s", low=1e-6, high=0.1)
+    amplifier_bandwidth_hz: float = parameter(
+        0.0,
+        "cut-off of the amplifier's first-order lag; 0: unlimited",
+        unit="Hz",
+        low=0.0,
+        high=1e9,
+    )
     delay_samples: int = parameter(1, "samples from deflection to reading", low=0, high=10)
     command_low: float = parameter(REACH[0], "lowest reachable deflection", unit="m")
     command_high: float = parameter(REACH[1], "highest reachable deflection", unit="m")

@@ -119,18 +119,8 @@ def hinf_controller(problem: DesignProblem) -> tuple[StateSpace, float]:
 
 def delayed_finger(finger: FingerModel) -> StateSpace:
     """Return the nominal finger, sampled, from command to delayed reading."""
-    box = linear_loop.fingers(finger.denominator, finger.sample_time, finger.delay_samples)
-    size = 2 + finger.delay_samples
-    a = np.zeros((size, size))
-    a[:2, :2] = box.a[0]
-    if finger.delay_samples:
-        a[2, 0] = 1.0
-        a[range(3, size), range(2, size - 1)] = 1.0
-    b = np.zeros((size, 1))
-    b[:2, 0] = box.b[0]
-    c = np.zeros((1, size))
-    c[0, 0 if finger.delay_samples == 0 else size - 1] = 1.0
-    return StateSpace(a, b, c, np.zeros((1, 1)))
+    way = linear_loop.open_loop(linear_loop.fingers(finger))
+    return StateSpace(way.a[0], way.b[0][:, None], way.c[None, :], np.zeros((1, 1)))
 
 
 def to_w_plane(system: StateSpace, step: float) -> StateSpace:

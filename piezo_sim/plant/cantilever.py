@@ -26,7 +26,7 @@ import numpy as np
 
 from piezo_control import creep, thermal
 from piezo_control.creep import Creep, CreepParameters, creep_step
-from piezo_control.dynamics import DynamicsParameters, Motion
+from piezo_control.dynamics import DynamicsParameters, ModesParameters, Motion
 from piezo_control.hysteresis import (
     Coefficients,
     HysteresisParameters,
@@ -66,6 +66,7 @@ class CantileverParameters:
     seed: int = parameter(1, "seed of the sensor's noise and drop-outs", low=0, high=2**63 - 1)
     hysteresis: HysteresisParameters = group(HysteresisParameters)
     dynamics: DynamicsParameters = group(DynamicsParameters)
+    modes: ModesParameters = group(ModesParameters)
     creep: CreepParameters = group(CreepParameters)
     thermal: ThermalParameters = group(ThermalParameters)
     contact: ContactParameters = group(ContactParameters)
@@ -124,7 +125,7 @@ def model(parameters: CantileverParameters) -> CantileverModel:
         bouc_wen=bouc_wen,
         thermal=thermal.discretize(p.thermal, slope, h),
         creep=creep.discretize(gain, gain_per_degc, times, shares, h),
-        tip=contact.discretize(p.contact, p.dynamics, h),
+        tip=contact.discretize(p.contact, p.dynamics, p.modes, h),
         sensor=Sensor(p.sensor.resolution, p.sensor.noise, p.sensor.dropout_rate),
     )
 
@@ -132,7 +133,10 @@ def model(parameters: CantileverParameters) -> CantileverModel:
 def deviating(
     m: CantileverModel, resonance: float, damping: float, stroke: float
 ) -> CantileverModel:
-    """Return the model with these factors on resonance, damping ratio and H_s; creep keeps its size."""
+    """Return the model with these factors on resonance, damping ratio and H_s.
+
+    Creep keeps its size, higher modes stay where they are.
+    """
     heat = m.thermal
     tip = m.tip
     return CantileverModel(
@@ -157,6 +161,9 @@ def deviating(
             tip.damping,
             tip.free_play,
             tip.sample_time,
+            tip.parts,
+            tip.shares,
+            tip.higher,
         ),
         m.sensor,
     )
@@ -170,7 +177,7 @@ def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> Can
         bouc_wen=BoucWenState(lag=[0.0], voltage=[0.0]),
         body=Body([temperature_degc], degc_at_start=[temperature_degc]),
         relaxations=[0.0] * len(m.creep.retained),
-        motion=Motion(x=[0.0], v=[0.0]),
+        motion=Motion(x=[0.0] * len(m.tip.shares), v=[0.0] * len(m.tip.shares)),
         tip_force=[0.0],
         readings=[0.0] * (delay_samples + 1),
     )
@@ -179,6 +186,8 @@ def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> Can
 def deflection_of(m: CantileverModel, s: CantileverState) -> float:
     """Return the true deflection (m) from the position at the start."""
     total = s.motion.x[0] + thermal_deflection(m.thermal, s.body)
+    for i in range(1, len(s.motion.x)):
+        total += s.motion.x[i]
     for i in range(len(s.relaxations)):
         total += s.relaxations[i]
     return total
@@ -208,6 +217,8 @@ def advance(
     warm(m.thermal, s.body, temperature_degc)
     drift = thermal_deflection(m.thermal, s.body) + crept
     move_tip(s.motion, m.tip, actuated + elastic, drift)
+    for i in range(1, len(s.motion.x)):
+        drift += s.motion.x[i]
     s.tip_force[0] = force + contact_force(m.tip, s.motion.x[0] + drift, s.motion.v[0])
 
 

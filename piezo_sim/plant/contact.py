@@ -11,6 +11,9 @@ is part of the equation of motion,
 
 stepped as exactly as the free tip. With an object in front, every sample is split into parts that are
 each in or out of contact, PART radians of the vibration in contact at most.
+
+Higher modes of the finger move the tip into the object and out of it, but its force acts on the first mode
+alone: that is where the compliance is.
 """
 
 from __future__ import annotations
@@ -19,7 +22,14 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from piezo_control.dynamics import DynamicsParameters, Motion, Propagator, move, propagator
+from piezo_control.dynamics import (
+    DynamicsParameters,
+    ModesParameters,
+    Motion,
+    Propagator,
+    move,
+    propagator,
+)
 from piezo_control.parameters import parameter
 
 PART = 0.05
@@ -53,11 +63,26 @@ class Tip(NamedTuple):
     a2: float  # of the denominator of D(s), s²
     a1: float  # s
     sample_time: float
+    shares: list[float]  # of the static deflection, one for each mode, the first one's first
+    higher: list[float]  # propagators of the modes but the first, four numbers each
 
 
-def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_time: float) -> Tip:
+def discretize(
+    contact: ContactParameters,
+    dynamics: DynamicsParameters,
+    modes: ModesParameters,
+    sample_time: float,
+) -> Tip:
     """Return the tip's exact motion for one sample time (s)."""
     a2, a1, _ = dynamics.denominator
+    parts = 1
+    if contact.stiffness > 0.0:
+        fastest = math.sqrt((1.0 + dynamics.elastic_constant * contact.stiffness) / a2)
+        parts = math.ceil(sample_time * fastest / PART)
+    higher: list[float] = []
+    for hertz, damping in zip(modes.frequency_hz, modes.damping):
+        omega = 2.0 * math.pi * hertz
+        higher += propagator(1.0 / omega**2, 2.0 * damping / omega, 1.0, sample_time / parts)
     return tip_of(
         a2,
         a1,
@@ -66,6 +91,9 @@ def discretize(contact: ContactParameters, dynamics: DynamicsParameters, sample_
         contact.damping,
         contact.free_play,
         sample_time,
+        parts,
+        [1.0 - sum(modes.share), *modes.share],
+        higher,
     )
 
 
@@ -77,13 +105,13 @@ def tip_of(
     damping: float,
     free_play: float,
     sample_time: float,
+    parts: int,
+    shares: list[float],
+    higher: list[float],
 ) -> Tip:
     """Return the tip's exact motion of these numbers; a step function too, for fingers that deviate."""
     total_damping = a1 + elastic_constant * damping
     total_stiffness = 1.0 + elastic_constant * stiffness
-    parts = 1
-    if stiffness > 0.0:
-        parts = math.ceil(sample_time * math.sqrt(total_stiffness / a2) / PART)
     return Tip(
         parts=parts,
         free=propagator(a2, a1, 1.0, sample_time / parts),
@@ -95,6 +123,8 @@ def tip_of(
         a2=a2,
         a1=a1,
         sample_time=sample_time,
+        shares=shares,
+        higher=higher,
     )
 
 
@@ -111,9 +141,17 @@ def move_tip(motion: Motion, tip: Tip, target: float, offset: float) -> None:
     `target` is H_s(U) + s_p F_external, `offset` is b = g(T) + Creep, both held within the sample (m).
     """
     compliance = tip.elastic_constant * tip.stiffness
-    held = (target - compliance * (offset - tip.free_play)) / (1.0 + compliance)
+    first = tip.shares[0] * target
     for _ in range(tip.parts):
-        if contact_force(tip, motion.x[0] + offset, motion.v[0]) < 0.0:
+        beside = offset
+        for i in range(1, len(motion.x)):
+            beside += motion.x[i]
+        if contact_force(tip, motion.x[0] + beside, motion.v[0]) < 0.0:
+            held = (first - compliance * (beside - tip.free_play)) / (1.0 + compliance)
             move(motion, tip.touching, held)
         else:
-            move(motion, tip.free, target)
+            move(motion, tip.free, first)
+        for i in range(1, len(motion.x)):
+            j = 4 * (i - 1)
+            own = Propagator(tip.higher[j], tip.higher[j + 1], tip.higher[j + 2], tip.higher[j + 3])
+            move(motion, own, tip.shares[i] * target, i)
