@@ -49,7 +49,15 @@ setup(
         "cluster": ["distributed"],  # `monte_carlo --scheduler`
         "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
         "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
-        "test": ["coverage", "hypothesis", "mypy", "pytest", "pytest-xdist", "ruff", "types-PyYAML"],
+        "test": [
+            "coverage",
+            "hypothesis",
+            "mypy",
+            "pytest",
+            "pytest-xdist",
+            "ruff",
+            "types-PyYAML",
+        ],
     },
     zip_safe=True,
     entry_points={

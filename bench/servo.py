@@ -14,10 +14,9 @@ import numpy as np
 from engine import row
 
 from piezo_control.compiled import compiled
-from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters
-from piezo_control.nodes.feedback import read_controller
 from piezo_control.servo.driver import FRESH
 from piezo_control.servo.law import (
     Laws,

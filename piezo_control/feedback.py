@@ -22,11 +22,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from piezo_control.parameters import ParameterError, parameter
+from piezo_control.parameters import ParameterError, build, load, parameter
+from piezo_control.shared import shared_folder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,6 +115,21 @@ class FeedbackParameters:
         shape = (self.order, self.order) if name == "a" else (self.order,)
         values = getattr(self, name)
         return np.reshape(values, shape) if values else np.zeros(shape)
+
+
+def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters:
+    """Return the controller called `name`, from `folder` or the shipped ones, or that of a parameter file.
+
+    Raises ParameterError naming the file, or the known controllers where there is no such file.
+    """
+    folders = [*([folder] if folder else []), shared_folder() / "params"]
+    named = [place / f"feedback_{name}.yaml" for place in folders]
+    path = next((path for path in [*named, Path(name)] if path.is_file()), None)
+    if path is None:
+        files = sorted(path for place in folders for path in place.glob("feedback_*.yaml"))
+        known = ", ".join(dict.fromkeys(path.stem.removeprefix("feedback_") for path in files))
+        raise ParameterError(f"controller '{name}' is no file, and not one of the known {known}")
+    return build(FeedbackParameters, load(path, "feedback"), str(path))
 
 
 def uncovered(

@@ -180,33 +180,66 @@ RosLoader.add_implicit_resolver(
 def load(path: str | Path, node: str) -> dict[str, Any]:
     """Return ``{dotted name: value}`` that a ROS parameter file gives to the node called `node`.
 
-    Keys match by their last part, as a tool has no namespace: an exact name, ``/finger/name`` as `ros2 param
-    dump` writes it, ``/**`` for every node; later matches win. Raises ParameterError naming the file when it cannot be read, is no
-    parameter file or has nothing for `node`.
+    Names match by their last part, as a tool has no namespace: an exact one, ``/finger/name`` as `ros2 param
+    dump` writes it, ``/**`` for every node; later matches win.
+
+    Raises ParameterError naming the file when it cannot be read, is no parameter file or has nothing for
+    `node`.
     """
+    values: dict[str, Any] = {}
+    sections = _sections(path)
+    matching = [
+        n for n in sections if fnmatch.fnmatchcase(node, n.split("/")[-1].replace("**", "*"))
+    ]
+    if not matching:
+        raise ParameterError(f"{path}: nothing for node '{node}'; it has {list(sections)}")
+    for name in matching:
+        values.update(_dotted(sections[name]))
+    return {n: value for n, value in values.items() if n.split(".")[0] not in OF_EVERY_NODE}
+
+
+def need_one_for(path: str | Path, nodes: Iterable[str]) -> None:
+    """Raise ParameterError for a ROS parameter file that has nothing for any of the `nodes`.
+
+    Nodes have their namespace, as in ``/finger/feedback``, and names match as ROS 2 matches them: ``*``
+    stands for one part of a name, ``**`` for any number of parts.
+    """
+    sections = _sections(path)
+    parts = {"*": r"/\w+", "**": r"(/\w+)*"}
+    for pattern in sections:
+        expression = "".join(parts.get(p, "/" + re.escape(p)) for p in pattern.split("/")[1:])
+        if any(re.fullmatch(expression, node) for node in nodes):
+            return
+    raise ParameterError(
+        f"{path}: nothing for node {' or '.join(map(repr, nodes))}; it has {list(sections)} ('/**/NAME' is "
+        "node NAME in any namespace)"
+    )
+
+
+def _sections(path: str | Path) -> dict[str, dict]:
+    """Return ``{node name: parameters}`` of a ROS parameter file; nested names are joined by '/'."""
     try:
         content = yaml.load(Path(path).read_text(), RosLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except OSError as error:
+        raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, yaml.YAMLError) as error:
         raise ParameterError(f"{path}: cannot be read as YAML: {error}") from None
     except RecursionError:
         raise ParameterError(f"{path}: cannot be read as YAML: nested too deeply") from None
     if not isinstance(content, dict):
         raise ParameterError(f"{path}: not a ROS parameter file: the top level is no mapping")
-    values: dict[str, Any] = {}
-    matched = False
-    for key, entry in content.items():
-        pattern = str(key).lstrip("/").replace("**/", "").replace("**", "*").split("/")[-1]
-        if fnmatch.fnmatchcase(node, pattern):
-            if not isinstance(entry, dict) or not isinstance(entry.get("ros__parameters"), dict):
-                raise ParameterError(f"{path}: '{key}' has no 'ros__parameters' mapping")
-            matched = True
-            values.update(_dotted(entry["ros__parameters"]))
-    for name in list(values):
-        if name.split(".")[0] in OF_EVERY_NODE:
-            del values[name]
-    if not matched:
-        raise ParameterError(f"{path}: nothing for node '{node}'; it has {list(content)}")
-    return values
+
+    def collect(tree: Mapping[Any, Any], namespace: str) -> dict[str, dict]:
+        found: dict[str, dict] = {}
+        for key, entry in tree.items():
+            name = f"{namespace}/{str(key).strip('/')}"
+            if not isinstance(entry, dict):
+                raise ParameterError(f"{path}: '{name}' has no 'ros__parameters' mapping")
+            own = entry.get("ros__parameters")
+            found.update({name: own} if isinstance(own, dict) else collect(entry, name))
+        return found
+
+    return collect(content, "")
 
 
 def _dotted(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -16,7 +16,13 @@ from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
 from piezo_sim.experiment import cli, paper, results
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
-from piezo_sim.experiment.cases import multisine, not_covered, profile, read_experiment
+from piezo_sim.experiment.cases import (
+    multisine,
+    not_covered,
+    params_folder,
+    profile,
+    read_experiment,
+)
 from piezo_sim.experiment.on_engine import run_on_engine
 
 LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
@@ -342,7 +348,13 @@ def test_recover_makes_a_whole_bag_of_a_cut_one(monkeypatch, tmp_path, capsys):
 def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, capsys):
     out = tmp_path / "none"
     for words, message in (
-        (("--controller", "unheard_of"), "feedback_unheard_of.yaml"),
+        (
+            ("--controller", "unheard_of"),
+            "not one of the known integrator_notch, paper, pid, robust",
+        ),
+        (("--amplitude-v", 20.0), "--amplitude-v has no effect on any run"),
+        (("--amplitude-um", 20e-6), "goes to 2e-05 um, must be 0 or from 0.01 to 1000 um"),
+        (("--temperature", 22.0, 22.0), "two cases are called 'step_open_loop_22degc'"),
         (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
         (("--duration", -1.0), "'duration' is -1.0, must be a number above 0.0"),
         (("--duration", math.inf), "'duration' is inf, must be a number above 0.0"),
@@ -353,6 +365,35 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
         assert run_cli(monkeypatch, "step", "--engine", "--out", out, *words) == 2
         assert message in capsys.readouterr().err
         assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("hysteresis", "--controller", "robust"), ("transient", "--amplitude-um", 20.0)],
+    ids=lambda words: words[1],
+)
+def test_an_option_without_effect_is_refused(monkeypatch, tmp_path, capsys, words):
+    assert run_cli(monkeypatch, *words, "--engine", "--out", tmp_path / "none") == 2
+    assert f"{words[1]} has no effect on any run of this experiment" in capsys.readouterr().err
+
+
+def test_a_controller_is_named_or_given_as_a_file(tmp_path):
+    file = tmp_path / "feedback_mine.yaml"
+    file.write_bytes((params_folder() / "feedback_robust.yaml").read_bytes())
+    _, cases = read_experiment("force", {"controller": ["robust", str(file)]})
+    names = [case.name for case in cases if case.mode == "feedback"]
+    assert names == ["force_feedback_robust_22degc", "force_feedback_mine_22degc"]
+    robust, mine = (case.parameters()["feedback"] for case in cases if case.mode == "feedback")
+    assert mine == robust
+
+
+def test_namespaces_and_lonely_bags_are_refused(monkeypatch, tmp_path, capsys, short):
+    with pytest.raises(SystemExit):
+        run_cli(monkeypatch, "step", "--namespace", "a b", "--out", tmp_path / "none")
+    assert "'a b' is no namespace" in capsys.readouterr().err
+    bag = bags(short, "transient")[0]
+    assert run_cli(monkeypatch, "compare", bag, "--out", tmp_path / "none") == 2
+    assert "two bags or more, not 1" in capsys.readouterr().err
 
 
 def test_own_parameters_apply_the_voltage_that_was_asked_for(tmp_path):

@@ -52,6 +52,15 @@ def write_bag(path, voltage, deflection, temperature=None, sample_time=1e-3, pre
     return path
 
 
+def test_micrometres_taken_for_metres_are_refused(tmp_path):
+    with pytest.raises(
+        MeasurementError, match="spans 19.75 m, must be at most .*--deflection COLUMN:um"
+    ):
+        read_measurement(
+            write_csv(tmp_path / "a.csv", header="time,voltage,deflection,temperature")
+        )
+
+
 def test_text_with_names_and_units(tmp_path):
     measurement = read_measurement(write_csv(tmp_path / "a.csv"))
     np.testing.assert_allclose(measurement.deflection[:3], [0.0, 0.25e-6, 0.5e-6])

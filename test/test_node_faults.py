@@ -6,19 +6,24 @@ import math
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
+import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
-from test_nodes import EXECUTABLES, TIMEOUT, Neighbour, neighbour, node, sample
+from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 
+from piezo_control.nodes import base
+from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_sim.experiment.cases import params_folder
 
 __all__ = ["neighbour"]  # a fixture of the module above
 SLEW = 4e4 * 1e-4  # V: default slew limit times sample time
@@ -326,16 +331,29 @@ def test_a_wild_voltage_neither_moves_the_tip_nor_goes_unnoticed(neighbour, tmp_
             "unknown parameter 'voltage_hihg'; did you mean 'voltage_high'?",
         ),
         (["-p", "weights:=[1.0e-7]"], "did you mean 'hysteresis.weights'?"),
+        (["--params-file", "{robust}"], "nothing for node '/feedforward'; it has ['/**/feedback']"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",
 )
-def test_unusable_arguments_end_with_one_line(arguments, words):
-    done = subprocess.run(
-        [EXECUTABLES / "feedforward", "--ros-args", *arguments],
-        capture_output=True, text=True, timeout=TIMEOUT,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert words in done.stderr and "Traceback" not in done.stderr
+def test_unusable_arguments_end_with_one_line(arguments, words, monkeypatch, capsys):
+    robust = params_folder() / "feedback_robust.yaml"
+    arguments = [argument.format(robust=robust) for argument in arguments]
+    monkeypatch.setattr(sys, "argv", ["feedforward", "--ros-args", *arguments])
+    monkeypatch.setattr(base.spin, "stop_event", threading.Event)  # pytest keeps its signals
+    assert base.run(FeedforwardNode) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_whole_numbers_stand_for_doubles():
+    given = ("voltage_high:=20", "hysteresis.weights:=[1]", "hysteresis.thresholds:=[0]")
+    rclpy.init(args=["--ros-args", *(word for text in given for word in ("-p", text))])
+    node = FeedforwardNode()
+    assert node.parameters.voltage_high == 20.0
+    assert node.parameters.hysteresis.weights == (1.0,)
+    assert node.set_parameters([Parameter("voltage_low", value=-7)])[0].successful
+    assert node.parameters.voltage_low == -7.0
+    node.destroy_node()
+    rclpy.shutdown()
 
 
 def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError, build, load, need_one_for
 
 
 def written(tmp_path, text):
@@ -35,6 +35,31 @@ def test_a_dump_of_a_running_node_is_read(tmp_path):
     assert load(written(tmp_path, text), "feedforward") == {"voltage_high": 35.0}
     with pytest.raises(ParameterError, match="nothing for node 'feedback'"):
         load(written(tmp_path, text), "feedback")
+
+
+@pytest.mark.parametrize(
+    ("name", "matches"),
+    [
+        ("/**", True),
+        ("/**/feedback", True),
+        ("/finger/feedback", True),
+        ("/*/feedback", True),
+        ("finger: {feedback", True),
+        ("/feedback", False),  # without the namespace, ROS 2 passes over it
+        ("/*", False),
+        ("/finger/feedback_2", False),
+    ],
+)
+def test_a_file_for_other_nodes_is_refused(tmp_path, name, matches):
+    end = "}" if "{" in name else ""
+    path = written(tmp_path, f"{name}: {{ros__parameters: {{voltage_high: 1.0}}}}{end}")
+    if matches:
+        need_one_for(path, ["/finger/feedforward", "/finger/feedback"])
+    else:
+        with pytest.raises(
+            ParameterError, match="nothing for node '/finger/feedback'; it has .*NAME"
+        ):
+            need_one_for(path, ["/finger/feedback"])
 
 
 def test_later_matches_win_and_wildcards_count(tmp_path):

@@ -22,9 +22,8 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
-from piezo_control.nodes.feedback import read_controller
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import ParameterError, load
 from piezo_control.profile import Profile
@@ -486,7 +485,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
             SetParameters, "servo/set_parameters", SetParameters.Request(parameters=[change])
         )
         assert answer.results[0].successful == taken
-    assert "not one of the shipped" in answer.results[0].reason
+    assert "not one of the known" in answer.results[0].reason
     stand.wait(lambda: "controller 'paper' takes over" in stand.log("servo"))
     # The finger dies: held, then at rest with a fault that names it, until a reset.
     stand.finger.kill()
@@ -516,7 +515,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     "arguments, text",
     [
         (["-p", "driver:=nowhere"], "'driver' is 'nowhere', must be 'simulated'"),
-        (["-p", "controller_file:=robsut"], "not one of the shipped"),
+        (["-p", "controller_file:=robsut"], "not one of the known"),
         (["-p", "write:=next_edge"], "was designed for a delay of 1 samples, this loop has 2"),
         (["-p", "feedforward_file:=/none.yaml"], "/none.yaml: cannot be read"),
     ],

@@ -63,7 +63,10 @@ def main() -> int:
         if out.exists() and not arguments.overwrite:
             raise ParameterError(f"{out} exists; name a new --out or give --overwrite")
         design = synthesize(problem)
-    except (ParameterError, SynthesisError) as error:
+    except ParameterError as error:
+        print(f"synthesize: {error}", file=sys.stderr)
+        return 2
+    except SynthesisError as error:
         print(f"synthesize: {arguments.problem}: {error}", file=sys.stderr)
         return 2
     certificate = certify(design.problem, design.controller, design.gamma)

@@ -24,6 +24,7 @@ from piezo_control.identification.table import (
     read_table,
 )
 from piezo_control.recording import recording
+from piezo_control.safety import LARGEST_DEFLECTION
 
 SHORTEST = 50  # samples
 QUANTITIES = {  # the units a column may have, the first of them where nothing says which
@@ -172,6 +173,12 @@ def read_text(
         raise MeasurementError(
             f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
             f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
+        )
+    stroke = np.ptp(values["deflection"][~empty])
+    if LARGEST_DEFLECTION < stroke < np.inf:
+        raise MeasurementError(
+            f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
+            "unit, as in --deflection COLUMN:um"
         )
     read = ", ".join(f"{q} = column '{table.headers[i]}' [{u}]" for q, (i, u) in places.items())
     left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""

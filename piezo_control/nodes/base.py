@@ -33,6 +33,7 @@ from piezo_control.parameters import (
     ParameterError,
     build,
     declarations,
+    need_one_for,
     unknown,
 )
 
@@ -72,6 +73,8 @@ class FingerNode(LifecycleNode):
             ParameterDescriptor(description="configure and activate at start", read_only=True),
         )
         self._declarations = declarations(self.PARAMETERS)
+        given = self._parameter_overrides  # of command line and files
+        given.update((p.name, p) for p in self._promoted(list(given.values())))
         for name, (kind, field) in self._declarations.items():
             default = field.default
             if default == ():  # an empty list shows no element type, so it is set after the type
@@ -88,6 +91,7 @@ class FingerNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.add_pre_set_parameters_callback(self._promoted)
         self.add_on_set_parameters_callback(self._validate)
         self.add_post_set_parameters_callback(self._changed)
 
@@ -185,6 +189,18 @@ class FingerNode(LifecycleNode):
             self.stop()
             self.active = False
 
+    def _promoted(self, given: list[Parameter]) -> list[Parameter]:
+        """Return the `given` parameters with whole numbers as doubles where doubles are declared."""
+        whole = (Parameter.Type.INTEGER, Parameter.Type.INTEGER_ARRAY)
+        promoted = []
+        for p in given:
+            kind = self._declarations[p.name][0] if p.name in self._declarations else None
+            if p.type_ in whole and kind in (float, tuple[float, ...]):
+                value = float(p.value) if kind is float else [float(v) for v in p.value]
+                p = Parameter(p.name, value=value)
+            promoted.append(p)
+        return promoted
+
     def _values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         values = {name: self.get_parameter(name).value for name in self._declarations}
         values.update(changes)
@@ -255,6 +271,9 @@ def run(*node_types: type[FingerNode]) -> int:
         for node_type in node_types:
             nodes.append(node_type())
         refuse_unknown(nodes)
+        for flag, path in zip(sys.argv, sys.argv[1:]):
+            if flag == "--params-file":  # rcl passes over one for other nodes without a word
+                need_one_for(path, [node.get_fully_qualified_name() for node in nodes])
         for node in nodes:
             if node.get_parameter("autostart").value:
                 if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:

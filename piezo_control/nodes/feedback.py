@@ -14,38 +14,21 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from rclpy.parameter import Parameter
 
-from piezo_control.feedback import Feedback, FeedbackParameters
+from piezo_control.feedback import Feedback, FeedbackParameters, read_controller
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
-from piezo_control.parameters import ParameterError, build, flatten, load
+from piezo_control.parameters import ParameterError, flatten
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch
-from piezo_control.shared import shared_folder
 from piezo_gripper_msgs.msg import Sample
 
 # What makes a controller; its limits of the command may change by themselves.
 DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high"}
-
-
-def read_controller(name: str) -> FeedbackParameters:
-    """Return the controller of a parameter file, or the shipped one called `name`.
-
-    Raises ParameterError naming the file, or the shipped controllers where there is no such file.
-    """
-    shipped = shared_folder() / "params" / f"feedback_{name}.yaml"
-    path = shipped if shipped.exists() else Path(name)
-    if not path.exists():
-        known = sorted(p.stem.removeprefix("feedback_") for p in shipped.parent.glob("feedback_*"))
-        raise ParameterError(
-            f"'controller_file' is '{name}', no file, and not one of the shipped {', '.join(known)}"
-        )
-    return build(FeedbackParameters, load(path, "feedback"), str(path))
 
 
 class FeedbackNode(BlockNode):

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from piezo_control.feedback import read_controller
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.feedback import read_controller
 from piezo_control.nodes.parameters import ServoNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE

@@ -293,6 +293,7 @@ def main() -> int:
     try:
         if (a.out / "servo.yaml").exists() and not a.overwrite:
             raise ParameterError(f"{a.out} has a servo.yaml; name a new --out or give --overwrite")
+        read_problem(a.problem)  # before anything moves
         limits = VoltageParameters(a.voltage_low, a.voltage_high, a.slew_limit)
         found = commission(
             Bench(a, limits, a.sensor_scale),

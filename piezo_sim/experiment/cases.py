@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from piezo_control.feedback import uncovered
+from piezo_control.feedback import read_controller, uncovered
 from piezo_control.feedforward import Feedforward
 from piezo_control.identification.excitation import decaying_sine
 from piezo_control.nodes.parameters import (
@@ -21,11 +21,13 @@ from piezo_control.nodes.parameters import (
     FeedforwardNodeParameters,
     RecorderParameters,
 )
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError, build, flatten, load
 from piezo_control.profile import Profile
+from piezo_control.safety import LARGEST_DEFLECTION, LARGEST_FORCE, LARGEST_VOLTAGE
 from piezo_control.shared import shared_folder
 from piezo_sim.nodes.parameters import CantileverNodeParameters, TemperatureNodeParameters
 from piezo_sim.plant.amplifier import AmplifierParameters
+from piezo_sim.plant.sensor import SensorParameters
 
 NODES = {
     "feedforward": FeedforwardNodeParameters,
@@ -46,7 +48,7 @@ COMPENSATORS = {
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
 EXPERIMENT_KEYS = {
     "title": "heading of the report",
-    "controller": "controllers of the runs with feedback: params/feedback_NAME.yaml; one, or a list",
+    "controller": "controllers of the runs with feedback, by name or file; one, or a list",
     "sample_time": "sample time of every node (s)",
     "plant": "class of the plant: prandtl_ishlinskii or truth",
     "temperature_degc": "list of constant temperatures (°C), one case for each",
@@ -70,6 +72,12 @@ RUN_KEYS = {
 """Keys of a run; those of the experiment hold where a run does not say otherwise."""
 NEEDED_KEYS = ("name", "duration", "sample_time", "mode")
 UNITS = {"um": 1e-6, "v": 1.0, "mn": 1e-3}
+SENSIBLE = {
+    "um": (SensorParameters().resolution, LARGEST_DEFLECTION),
+    "v": (0.0, LARGEST_VOLTAGE),
+    "mn": (0.0, LARGEST_FORCE),
+}
+"""Unit to smallest and largest height in SI: metres given as micrometres are below what the sensor tells apart."""
 
 
 @dataclass(frozen=True)
@@ -138,10 +146,7 @@ class Case:
         }
         given = {n: own_parameters(self.params, n) for n in NODES}
         if self.mode == "feedback":
-            file = f"feedback_{self.controller}.yaml"
-            own = self.params / file if self.params else None
-            shipped = params_folder() / file
-            given["feedback"] = load(own if own and own.exists() else shipped, "feedback")
+            given["feedback"] = flatten(read_controller(self.controller, self.params))
         parameters: dict[str, Any] = {}
         for name, kind in NODES.items():  # the feedforward first: it knows what can be reached
             if name == "feedback" and self.mode != "feedback":
@@ -216,6 +221,21 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
     """
     if "params" in overrides:
         _need_parameters(overrides["params"])
+    title, runs = _runs(name)
+    _need_effect(overrides, [run for _, run, _ in runs])
+    cases = [
+        case
+        for experiment, run, where in runs
+        for case in _expand(experiment, _overridden(run, overrides), where)
+    ]
+    names = [case.name for case in cases]
+    for double in {name for name in names if names.count(name) > 1}:
+        raise ParameterError(f"two cases are called '{double}': name nothing twice")
+    return title, cases
+
+
+def _runs(name: str) -> tuple[str, list[tuple[str, dict[str, Any], str]]]:
+    """Return the title of an experiment, and (experiment, run, where that is written) of each run."""
     path = params_folder() / "experiments" / f"{name}.yaml"
     try:
         content = yaml.safe_load(path.read_text())
@@ -225,15 +245,31 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
     members = content.pop("experiments", None)
     if members is not None:
         return title, [
-            case for m in members for case in read_experiment(m, {**content, **overrides})[1]
+            (experiment, _overridden(run, content), where)
+            for member in members
+            for experiment, run, where in _runs(member)[1]
         ]
     _refuse_unknown(content, EXPERIMENT_KEYS, str(path))
-    cases: list[Case] = []
+    runs = []
     for run in content.pop("runs"):
         where = f"{path}: run '{run.get('name')}'"
         _refuse_unknown(run, RUN_KEYS, where)
-        cases += _expand(name, _overridden({**content, **run}, overrides), where)
-    return title, cases
+        runs.append((name, {**content, **run}, where))
+    return title, runs
+
+
+def _need_effect(overrides: Mapping[str, Any], runs: Iterable[Mapping[str, Any]]) -> None:
+    """Refuse an override that changes nothing in any of the runs."""
+    has_effect = {
+        "controller": any("feedback" in _listed(run["mode"]) for run in runs),
+        "amplitude_um": any("amplitude_um" in run.get("reference", {}) for run in runs),
+        "amplitude_v": any("amplitude_v" in run.get("voltage", {}) for run in runs),
+    }
+    for name in overrides:
+        if not has_effect.get(name, True):
+            raise ParameterError(
+                f"--{name.replace('_', '-')} has no effect on any run of this experiment"
+            )
 
 
 def _need_parameters(folder: Path) -> None:
@@ -291,7 +327,8 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
             controller = "none"
         parts = [run["name"]]
         parts += [mode] if isinstance(run["mode"], list) else []
-        parts += [controller] if len(controllers) > 1 and mode == "feedback" else []
+        if len(controllers) > 1 and mode == "feedback":
+            parts.append(Path(controller).stem.removeprefix("feedback_"))
         parts += [] if degc is None else [f"{degc:g}degc"]
         cases.append(
             Case(
@@ -381,6 +418,12 @@ def profile(shape: Mapping[str, Any], unit: str, where: str) -> Profile:
         raise ParameterError(f"{where}: shape '{kind}': {error}") from None
     if values:
         raise ParameterError(f"{where}: shape '{kind}' does not know {sorted(values)}")
+    peak = float(np.max(np.abs(made.value))) / scale
+    least, most = (value / scale for value in SENSIBLE[unit])
+    if peak and not least <= peak <= most:
+        raise ParameterError(
+            f"{where}: shape '{kind}' goes to {peak:g} {unit}, must be 0 or from {least:g} to {most:g} {unit}"
+        )
     return made
 
 

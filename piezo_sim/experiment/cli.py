@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -129,6 +130,8 @@ def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> N
     from piezo_sim.experiment.bags import compare_bags
 
     found = _read_bags(arguments)
+    if len(found) < 2:
+        raise ParameterError(f"compare needs two bags or more, not {len(found)}")
     with results_folder(out, overwrite=True) as folder:
         section = compare_bags(found, arguments.kind, folder)
         write_html(folder / "report.html", "Comparison of recorded bags", [section])
@@ -182,10 +185,12 @@ def parser() -> argparse.ArgumentParser:
 def _add_experiment_options(command: argparse.ArgumentParser, name: str) -> None:
     command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
     command.add_argument("--overwrite", action="store_true", help="replace results in --out")
-    command.add_argument("--namespace", default="finger", help="namespace of the nodes")
+    command.add_argument(
+        "--namespace", type=namespace, default="finger", help="namespace of the nodes"
+    )
     command.add_argument(
         "--controller", nargs="+", metavar="NAME",
-        help="controllers of the runs with feedback: params/feedback_NAME.yaml",
+        help="controllers of the runs with feedback: shipped ones by name, your own by their files",
     )  # fmt: skip
     command.add_argument(
         "--plant", choices=("prandtl_ishlinskii", "truth"), help="class of the plant"
@@ -225,6 +230,13 @@ def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) ->
     command.add_argument(
         "--partial", action="store_true", help="use what can be read of a damaged bag"
     )
+
+
+def namespace(text: str) -> str:
+    """Return a namespace that ROS 2 accepts."""
+    if not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", text, re.ASCII):
+        raise argparse.ArgumentTypeError(f"'{text}' is no namespace: letters, digits and '_'")
+    return text
 
 
 OVERRIDES = (

@@ -20,10 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import StepMetrics, step_metrics
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.thermal import REFERENCE_DEGC
 from piezo_sim.engine import Deviations, run_deviating
@@ -131,14 +131,19 @@ def monte_carlo(
     Chunks already in `folder` are not run again; `progress` is called with the draws done and all.
     Raises ParameterError when `folder` holds draws of another study.
     """
+    for name, least, value in (
+        ("draws", 1, draws),
+        ("workers", 1, workers),
+        ("seed", 0, study.seed),
+    ):
+        if value is not None and value < least:
+            raise ParameterError(f"'{name}' is {value}, must be {least} or more")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     study_file = folder / "study.txt"
     if study_file.exists() and study_file.read_text() != repr(study):
         raise ParameterError(f"{study_file}: belongs to another study; use another folder")
     study_file.write_text(repr(study))
-    if draws < 1:
-        raise ParameterError(f"'draws' is {draws}, must be 1 or more")
     files = [folder / f"chunk_{chunk:05d}.npy" for chunk in range(-(-draws // CHUNK))]
     missing = [chunk for chunk, file in enumerate(files) if not file.exists()]
     done = len(files) - len(missing)
@@ -159,7 +164,9 @@ def monte_carlo(
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line: a study, its progress, the percentiles; return 0 done, 2 unusable input."""
     parser = argparse.ArgumentParser(prog="monte_carlo", description=__doc__.splitlines()[0])
-    parser.add_argument("controller", help="parameter file of the node 'feedback'")
+    parser.add_argument(
+        "controller", help="name of a shipped controller, or parameter file of the node 'feedback'"
+    )
     parser.add_argument(
         "--out", default="out/monte_carlo", help="folder; started again, it goes on"
     )
@@ -175,8 +182,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     given = parser.parse_args(arguments)
     try:
-        values = load(given.controller, "feedback")
-        feedback = build(FeedbackParameters, values, source=given.controller)
+        feedback = read_controller(given.controller)
         widths = {name: getattr(given, name) for name in FACTORS}
         study = Study(feedback=feedback, seed=given.seed, **widths)
         result = monte_carlo(
