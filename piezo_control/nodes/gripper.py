@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two fingers as one gripper: bring them to an opening, or stop at a force.
 
-action:   grip (Grip: opening m, max_force N, speed m/s)
+actions:  grip (Grip: opening m, max_force N, speed m/s); where control_msgs is installed, ~/gripper_cmd
+          (ParallelGripperCommand or GripperCommand)
 in:       FINGER/state (FingerState) of both fingers, ~/joint_commands (sensor_msgs/JointState),
           ~/joint_trajectory (trajectory_msgs/JointTrajectory)
 out:      FINGER/reference_profile (Profile, m) of both fingers, joint_states (sensor_msgs/JointState)
@@ -19,6 +20,7 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from time import monotonic
 from typing import Any
 
@@ -42,7 +44,7 @@ from piezo_control.gripper import (
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes import spin
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.faces.actions import GripFace
+from piezo_control.nodes.faces.actions import ActionFace, GripFace
 from piezo_control.nodes.faces.asker import Asker, Measured
 from piezo_control.nodes.faces.joint_commands import JointCommands
 from piezo_control.nodes.faces.joint_states import JointStates
@@ -81,6 +83,14 @@ class GripperNodeParameters(GripperParameters):
     )
     joint_state_rate: float = parameter(
         100.0, "how often `joint_states` is published", unit="Hz", low=1.0, high=1000.0
+    )
+    control_action: str = parameter(
+        "ParallelGripperCommand",
+        "action of control_msgs that `~/gripper_cmd` has, where that package is installed; fixed at start",
+        choices=("ParallelGripperCommand", "GripperCommand", "none"),
+    )
+    allow_stalling: bool = parameter(
+        True, "`~/gripper_cmd`: a goal that ends by its force counts as succeeded, else as aborted"
     )
     zero_limit: float = parameter(
         2e-6, "largest deflection that `~/zero` takes for 0", unit="m", low=0.0, high=1e-4
@@ -229,8 +239,27 @@ class GripperNode(FingerNode):
         self.motion: Motion | None = None
         self.asker: Asker | None = None  # whose motion it is
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
-        self.actions = [GripFace(self, "grip")]  # there when inactive too, to refuse
+        self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
+        self._serve_control_action()
         self.faces: list[JointStates | JointCommands | Services] = []
+
+    def _serve_control_action(self) -> None:
+        name = self.parameters.control_action
+        if name == "none":
+            return
+        if find_spec("control_msgs") is None:
+            self.get_logger().info("'~/gripper_cmd' is not served: control_msgs is not installed")
+            return
+        from piezo_control.nodes.faces.control_actions import FACES
+
+        self.actions.append(FACES[name](self, "~/gripper_cmd"))
+
+    def refuses_while_active(self, names: set[str]) -> set[str]:
+        return names - {"allow_stalling", "zero_limit"}
+
+    def check(self, parameters: GripperNodeParameters) -> None:
+        if parameters.control_action != self.parameters.control_action:
+            raise ParameterError("'control_action' is fixed at start")
 
     def destroy_node(self) -> None:
         for action in self.actions:
