@@ -5,6 +5,7 @@ from os.path import dirname, join
 from setuptools import Extension, find_packages, setup
 
 NAME = "piezo_gripper"
+DESCRIPTION = glob("description/*.*") + glob("description/config/*")
 PARAMS = [path for path in glob("params/**", recursive=True) if path.endswith((".yaml", ".xml"))]
 
 
@@ -29,7 +30,15 @@ setup(
     ],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
-        *shared(["package.xml", *PARAMS, *glob("launch/*.launch.py"), *glob("msg_defs/msg/*.msg")]),
+        *shared(
+            [
+                "package.xml",
+                *PARAMS,
+                *DESCRIPTION,
+                *glob("launch/*.launch.py"),
+                *glob("msg_defs/msg/*.msg"),
+            ]
+        ),
     ],
     python_requires=">=3.10",
     install_requires=[

@@ -1,24 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A gripper: two fingers in the namespaces left and right, and the action server in front of them."""
+"""A gripper: two fingers in the namespaces left and right, and the gripper node in front of them.
+
+`rviz:=true` shows it, where robot_state_publisher and rviz2 are installed.
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.conditions import IfCondition
+from launch.substitutions import Command, LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 FINGERS = ("left", "right")
+ARGUMENTS = {
+    "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
+    "joint_states": (
+        "joint_states",
+        "topic of joint states; behind ros2_control: gripper/joint_states",
+    ),
+    "rviz": ("false", "show the gripper in RViz"),
+    "visual_scale": ("20", "RViz shows ways across the gap so much larger"),
+}
 
 
 def generate_launch_description() -> LaunchDescription:
     share = FindPackageShare("piezo_gripper")
     finger = PathJoinSubstitution([share, "launch", "finger.launch.py"])
+    xacro = PathJoinSubstitution([share, "description", "piezo_gripper.urdf.xacro"])
+    scale = LaunchConfiguration("visual_scale")
+    description = Command(["xacro ", xacro, " ros2_control:=false visual_scale:=", scale])
+    layout = PathJoinSubstitution([share, "description", "config", "gripper.rviz"])
+    joint_states = ("joint_states", LaunchConfiguration("joint_states"))
+    shown = IfCondition(LaunchConfiguration("rviz"))
     return LaunchDescription(
         [
-            DeclareLaunchArgument(
-                "sample_time",
-                default_value="0.0001",
-                description="sample time in s, of fingers and gripper alike",
+            *(
+                DeclareLaunchArgument(name, default_value=value, description=text)
+                for name, (value, text) in ARGUMENTS.items()
             ),
             *(
                 IncludeLaunchDescription(finger, launch_arguments={"namespace": side}.items())
@@ -33,6 +52,22 @@ def generate_launch_description() -> LaunchDescription:
                         "sample_time": LaunchConfiguration("sample_time"),
                     },
                 ],
+                remappings=[joint_states],
+                output="screen",
+            ),
+            Node(
+                package="robot_state_publisher",
+                executable="robot_state_publisher",
+                parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
+                remappings=[joint_states],
+                condition=shown,
+                output="screen",
+            ),
+            Node(
+                package="rviz2",
+                executable="rviz2",
+                arguments=["-d", layout],
+                condition=shown,
                 output="screen",
             ),
         ]

@@ -53,6 +53,7 @@ JAZZY_PACKAGES = {
     "std_msgs",
     "std_srvs",
     "trajectory_msgs",
+    "xacro",
 }
 # ... and keys of rosdep/python.yaml that resolve on Ubuntu noble. There is no key for mcap, none for
 # numba that noble has a package for, and those for control and slycot do not begin with python3.
@@ -123,7 +124,9 @@ def test_executables_are_installed():
     assert installed == declared
 
 
-@pytest.mark.parametrize("pattern", ["params/**/*.yaml", "params/**/*.xml", "launch/*.launch.py"])
+@pytest.mark.parametrize(
+    "pattern", ["params/**/*.yaml", "params/**/*.xml", "launch/*.launch.py", "description/**/*.*"]
+)
 def test_data_files_are_installed_as_they_are(pattern):
     share = Path(get_package_share_directory("piezo_gripper"))
     here = {p.relative_to(ROOT): p.read_bytes() for p in ROOT.glob(pattern)}

@@ -124,13 +124,14 @@ if [ -f .venv/place ] && [ "$(<.venv/place)" != "$place" ]; then
   rm -rf .venv build install
 fi
 
-# Editing a module needs no build: install/ links to it. A new file in params/ or launch/ does, or a new Python package.
+# Editing a module needs no build: install/ links to it. A new file in params/, launch/ or description/ does, or a new Python package.
 pins=$(cat requirements/*.txt | fingerprint)
 sources=$({
   echo "$place $pins"
   cat package.xml setup.py setup.cfg tools/*.bash tools/*.cmake
   cat piezo_control/servo/drivers/*.[ch]
-  find params launch piezo_control piezo_sim '(' -name __init__.py -o -path 'params/*' -o -path 'launch/*' ')' -type f |
+  find params launch description piezo_control piezo_sim '(' -name __init__.py -o -path 'params/*' -o -path 'launch/*' \
+    -o -path 'description/*' ')' -type f |
     grep -v __pycache__ | LC_ALL=C sort
   find msg_defs -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum
 } | fingerprint)
