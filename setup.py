@@ -75,6 +75,7 @@ setup(
             "temperature = piezo_sim.start:temperature",
             "feedforward = piezo_control.start:feedforward",
             "feedback = piezo_control.start:feedback",
+            "fingerctl = piezo_control.start:fingerctl",
             "finger = piezo_sim.start:finger",
             "recorder = piezo_control.start:recorder",
             "experiment = piezo_sim.start:experiment",

@@ -132,6 +132,19 @@ def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters
     return build(FeedbackParameters, load(path, "feedback"), str(path))
 
 
+def successor(name: str, present: FeedbackParameters) -> FeedbackParameters:
+    """Return the controller that takes over from the `present` one: that of :func:`read_controller`, or 'none'.
+
+    Open loop goes on at the sample time and with the limits of the present controller.
+    """
+    if name != "none":
+        return read_controller(name)
+    p = present
+    return FeedbackParameters(
+        sample_time=p.sample_time, command_low=p.command_low, command_high=p.command_high
+    )
+
+
 def uncovered(
     parameters: FeedbackParameters,
     delay_samples: int,

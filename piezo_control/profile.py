@@ -3,8 +3,21 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+
+class Signal(Protocol):
+    """A reference (m) or a tip force (N) over time."""
+
+    @property
+    def largest(self) -> float:
+        """Size that no value exceeds."""
+
+    def at(self, time: ArrayLike) -> NDArray[np.float64]:
+        """Return the values at `time` (s since sample 0, any shape)."""
 
 
 class Profile:
@@ -53,6 +66,11 @@ class Profile:
                 f"{self.time[i]:g} s; must increase"
             )
 
+    @property
+    def largest(self) -> float:
+        """Size that no value exceeds."""
+        return float(np.max(np.abs(self.value)))
+
     def part(self, begin: float, end: float) -> Profile:
         """Return the profile between two instants (s); it stays where it is at the end."""
         inside = self.time[(self.time > begin) & (self.time < end)]
@@ -67,16 +85,16 @@ class Profile:
         return self.value[np.maximum(index, 0)]
 
 
-class SampledProfile:
-    """A profile read sample by sample: ``sampled[k]`` is the value at k * sample_time, as a float.
+class SampledSignal:
+    """A signal read sample by sample: ``sampled[k]`` is the value at k * sample_time, as a float.
 
     Values are computed in blocks, because one look-up at a time costs more than the control law.
     """
 
     BLOCK = 1024
 
-    def __init__(self, profile: Profile, sample_time: float) -> None:
-        self.profile = profile
+    def __init__(self, signal: Signal, sample_time: float) -> None:
+        self.signal = signal
         self.sample_time = sample_time
         self._first = 0
         self._values: list[float] = []
@@ -87,5 +105,5 @@ class SampledProfile:
             self._first = number
             index = 0
             numbers = np.arange(number, number + self.BLOCK)
-            self._values = self.profile.at(numbers * self.sample_time).tolist()
+            self._values = self.signal.at(numbers * self.sample_time).tolist()
         return self._values[index]

@@ -21,6 +21,7 @@ def executable(module: str) -> Callable[[], int]:
 
 commission = executable("piezo_control.servo.commission")
 feedback = executable("piezo_control.nodes.feedback")
+fingerctl = executable("piezo_control.nodes.fingerctl")
 feedforward = executable("piezo_control.nodes.feedforward")
 gripper = executable("piezo_control.nodes.gripper")
 identify = executable("piezo_control.identification.cli")

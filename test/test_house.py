@@ -12,7 +12,17 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Bottom to top; the longest matching name counts. A module imports from its own level or below.
 LEVELS = [
-    {"parameters", "profile", "metrics", "safety", "sequence", "shared", "compiled", "start"},
+    {
+        "parameters",
+        "profile",
+        "waveform",
+        "metrics",
+        "safety",
+        "sequence",
+        "shared",
+        "compiled",
+        "start",
+    },
     {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
     {"shaping", "feedforward", "sensorless", "thermometer", "design"},
     {"identification", "servo", "touch"},

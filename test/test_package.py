@@ -20,6 +20,7 @@ EXECUTABLES = {
     "temperature",
     "feedforward",
     "feedback",
+    "fingerctl",
     "recorder",
     "experiment",
     "identify",

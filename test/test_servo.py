@@ -24,6 +24,7 @@ from std_srvs.srv import Trigger
 
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.profile_input import waveform_message
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import ParameterError, load
 from piezo_control.profile import Profile
@@ -40,7 +41,9 @@ from piezo_control.servo.driver import (
 from piezo_control.servo.law import laws_of, put_controller, servo_step, settings_of, watch_at_rest
 from piezo_control.servo.loop import Servo
 from piezo_control.servo.parameters import ServoParameters
+from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
+from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 from piezo_sim.driver import Simulation
 from piezo_sim.engine import run
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
@@ -385,6 +388,7 @@ class Stand:
         self.node.create_subscription(FingerState, "state", self.states.append, LATCHED)
         self.node.create_subscription(SampleBlock, "samples", self.blocks.append, SAMPLE)
         self.reference = self.node.create_publisher(Sample, "reference", SETPOINT)
+        self.waveform = self.node.create_publisher(WaveformMessage, "reference_waveform", SETPOINT)
         self.servo = None
 
     def commission(self):
@@ -478,6 +482,17 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     stand.reference.publish(Sample(value=20e-6))
     stand.wait(lambda: stand.is_at(20e-6))
     stand.wait(lambda: stand.states[-1].on_target)
+    # A waveform, evaluated at every sample.
+    wave = Waveform("triangle", 5e-6, frequency=4.0, offset=15e-6)
+    stand.waveform.publish(waveform_message(wave))
+
+    def follows_the_wave():
+        block = stand.blocks[-1]
+        expected = wave.at((block.number + np.arange(len(block.reference))) * block.period)
+        return np.allclose(block.reference, expected, rtol=0.0, atol=1e-12)
+
+    stand.wait(follows_the_wave)
+    stand.reference.publish(Sample(value=20e-6))
     # Another controller while it runs, and what cannot be taken is refused.
     for name, taken in (("paper", True), ("robsut", False)):
         change = Parameter("controller_file", value=name).to_parameter_msg()

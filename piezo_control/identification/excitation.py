@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from piezo_control.profile import Profile
+from piezo_control.waveform import Waveform
 
 
 def decaying_sine(
@@ -41,8 +42,6 @@ def decaying_sine(
         raise ValueError(f"cycles is {cycles}, must be at least 2")
     if not frequency_hz > 0.0:
         raise ValueError(f"frequency_hz is {frequency_hz}, must be positive")
-    cycle = np.arange(cycles * points_per_cycle + 1) / points_per_cycle
-    envelope = np.minimum(1.0, (cycles - cycle) / (cycles - 1))
-    return Profile(
-        cycle / frequency_hz, amplitude * envelope * np.sin(2.0 * np.pi * cycle), linear=True
-    )
+    wave = Waveform("decaying_sine", amplitude, frequency_hz, duration=cycles / frequency_hz)
+    time = np.arange(cycles * points_per_cycle + 1) / (points_per_cycle * frequency_hz)
+    return Profile(time, wave.at(time), linear=True)

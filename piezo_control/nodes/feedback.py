@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The block K of the paper's loop: from the deflection and the reference to the command.
 
-in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m)
+in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m),
+     reference_waveform (Waveform, m)
 out: command (Sample, m)
 
-The newest of set-point and profile is followed. With `controller: none` the reference passes through:
+The newest of set-point, profile and waveform is followed. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
 loop runs, with the command where it was. Running free, nothing is answered before the deflections come at
 the sample time that the controller was made for, and a loop that falls behind ends in a fault.
@@ -18,7 +19,7 @@ from typing import Any
 
 from rclpy.parameter import Parameter
 
-from piezo_control.feedback import Feedback, FeedbackParameters, read_controller
+from piezo_control.feedback import Feedback, FeedbackParameters, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedbackNodeParameters
@@ -54,7 +55,7 @@ class FeedbackNode(BlockNode):
     def check(self, parameters: FeedbackNodeParameters) -> None:
         """Refuse the half of a controller, and one that cannot take over where the loop is."""
         if parameters.controller_file not in ("", self.parameters.controller_file):
-            controller = read_controller(parameters.controller_file)
+            controller = successor(parameters.controller_file, self.parameters)
             if self.active and controller.sample_time != parameters.sample_time:
                 raise ParameterError(
                     f"'controller_file' is '{parameters.controller_file}', made for "
@@ -117,7 +118,7 @@ class FeedbackNode(BlockNode):
         name = self.parameters.controller_file
         if name in ("", self._file):
             return False
-        controller = flatten(read_controller(name))
+        controller = flatten(successor(name, self.parameters))
         self._file, self._loading = name, True
         changes = [
             Parameter(

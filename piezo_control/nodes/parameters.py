@@ -70,7 +70,7 @@ class FeedbackNodeParameters(FeedbackParameters, LoopParameters):
 
     controller_file: str = parameter(
         "",
-        "parameter file to take the whole controller from, or the name of a shipped one ('robust')",
+        "parameter file to take the whole controller from, the name of a shipped one ('robust'), or 'none'",
     )
 
 
@@ -86,7 +86,7 @@ class ServoNodeParameters(ServoParameters):
     )
     controller_file: str = parameter(
         "robust",
-        "parameter file of the controller, or the name of a shipped one; also while running",
+        "parameter file of the controller, the name of a shipped one, or 'none'; also while running",
     )
     feedforward_file: str = parameter(
         "", "parameter file of the inverse hysteresis and the limits; empty: the paper's finger"
@@ -118,8 +118,8 @@ class ServoNodeParameters(ServoParameters):
 
 
 RECORDED = (
-    "reference", "reference_profile", "deflection", "command", "voltage", "samples", "temperature",
-    "tip_force", "tip_force_profile", "state",
+    "reference", "reference_profile", "reference_waveform", "deflection", "command", "voltage", "samples",
+    "temperature", "tip_force", "tip_force_profile", "tip_force_waveform", "state",
 )  # fmt: skip
 """Topics of a finger."""
 

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A signal that a node takes as single values or as a profile that travels ahead: the newest counts."""
+"""A signal that a node takes as single values, a profile that travels ahead or a waveform: the newest counts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
 from rclpy.node import Node
 
 from piezo_control.nodes.qos import LATCHED, SETPOINT
-from piezo_control.profile import Profile, SampledProfile
+from piezo_control.profile import Profile, SampledSignal, Signal
+from piezo_control.waveform import SHAPES, Waveform
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
+from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 
 def to_message(profile: Profile) -> ProfileMessage:
@@ -23,10 +24,17 @@ def to_message(profile: Profile) -> ProfileMessage:
     )
 
 
-class ProfileInput:
-    """Subscribes TOPIC (Sample) and TOPIC_profile (Profile); ``input[k]`` is the value at sample k.
+def waveform_message(waveform: Waveform) -> WaveformMessage:
+    """Return the message that says `waveform`."""
+    numbers = {name: float(value) for name, value in vars(waveform).items() if name != "shape"}
+    return WaveformMessage(shape=SHAPES.index(waveform.shape), **numbers)
 
-    `on_change()` is called with every new one.
+
+class ProfileInput:
+    """Subscribes TOPIC (Sample), TOPIC_profile and TOPIC_waveform; ``input[k]`` is the value at sample k.
+
+    A profile is kept for who joins later; a waveform moves the fingers that are there when it is sent.
+    `on_change()` is called with every new signal.
     """
 
     def __init__(
@@ -41,39 +49,53 @@ class ProfileInput:
         self._node = node
         self._topic = topic
         self._largest = largest
-        self._sampled = SampledProfile(Profile([0.0], [0.0]), sample_time)
+        self._sampled = SampledSignal(Profile([0.0], [0.0]), sample_time)
         node.create_subscription(Sample, topic, self._on_value, SETPOINT)
         node.create_subscription(ProfileMessage, f"{topic}_profile", self._on_profile, LATCHED)
+        node.create_subscription(WaveformMessage, f"{topic}_waveform", self._on_waveform, SETPOINT)
 
     def __getitem__(self, number: int) -> float:
         return self._sampled[number]
 
     @property
-    def profile(self) -> Profile:
+    def signal(self) -> Signal:
         """The signal over time."""
-        return self._sampled.profile
+        return self._sampled.signal
 
     def restart(self, sample_time: float) -> None:
         """Read the same signal at another sample time."""
-        self._sampled = SampledProfile(self._sampled.profile, sample_time)
+        self._sampled = SampledSignal(self._sampled.signal, sample_time)
 
     def _on_value(self, sample: Sample) -> None:
-        self._take(self._topic, [0.0], [sample.value], linear=False)
+        self._take(self._topic, lambda: Profile([0.0], [sample.value]))
 
     def _on_profile(self, message: ProfileMessage) -> None:
         linear = message.interpolation == ProfileMessage.LINEAR
-        self._take(f"{self._topic}_profile", message.time, message.value, linear)
+        self._take(f"{self._topic}_profile", lambda: Profile(message.time, message.value, linear))
 
-    def _take(self, topic: str, time: list[float], value: list[float], linear: bool) -> None:
-        try:
-            profile = Profile(time, value, linear)
-            if not np.all(np.abs(profile.value) <= self._largest):
+    def _on_waveform(self, message: WaveformMessage) -> None:
+        def make() -> Waveform:
+            waveform = Waveform.of(message)
+            rate = 1.0 / self._sampled.sample_time
+            if waveform.highest_frequency > 0.5 * rate:
                 raise ValueError(
-                    f"value is up to {np.max(np.abs(profile.value)):g}, must be within "
-                    f"±{self._largest:g}; the unit is that of the topic, m or N"
+                    f"frequency is up to {waveform.highest_frequency:g} Hz, must be at most half the loop's "
+                    f"{rate:g} Hz"
+                )
+            return waveform
+
+        self._take(f"{self._topic}_waveform", make)
+
+    def _take(self, topic: str, make: Callable[[], Signal]) -> None:
+        try:
+            signal = make()
+            if not signal.largest <= self._largest:
+                raise ValueError(
+                    f"value is up to {signal.largest:g}, must be within ±{self._largest:g}; the unit is that "
+                    "of the topic, m or N"
                 )
         except ValueError as error:
             self._node.get_logger().error(f"'{topic}' ignored: {error}")
             return
-        self._sampled = SampledProfile(profile, self._sampled.sample_time)
+        self._sampled = SampledSignal(signal, self._sampled.sample_time)
         self._on_change()

@@ -33,6 +33,7 @@ from piezo_control.recording.recording import (
     PROFILE_TYPE,
     SAMPLE_TYPE,
     TEMPERATURE_TYPE,
+    WAVEFORM_TYPE,
 )
 from piezo_control.recording.writer import BagWriter
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
@@ -41,6 +42,7 @@ from piezo_gripper_msgs.msg import RecorderState
 FINGER = {
     "reference": (SAMPLE_TYPE, SAMPLE),
     "reference_profile": (PROFILE_TYPE, LATCHED),
+    "reference_waveform": (WAVEFORM_TYPE, SAMPLE),
     "deflection": (SAMPLE_TYPE, SAMPLE),
     "command": (SAMPLE_TYPE, SAMPLE),
     "voltage": (SAMPLE_TYPE, SAMPLE),
@@ -48,6 +50,7 @@ FINGER = {
     "temperature": (TEMPERATURE_TYPE, SAMPLE),
     "tip_force": (SAMPLE_TYPE, SAMPLE),
     "tip_force_profile": (PROFILE_TYPE, LATCHED),
+    "tip_force_waveform": (WAVEFORM_TYPE, SAMPLE),
     "state": ("piezo_gripper_msgs/msg/FingerState", LATCHED),
 }
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing

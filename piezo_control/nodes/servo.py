@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop in real time: K and H_s⁻¹ between a deflection sensor and a voltage amplifier.
 
-in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0)
+in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0),
+     reference_waveform (Waveform, m)
 out: samples (SampleBlock: every sample), deflection (Sample, m), command (Sample, m), voltage (Sample, V): one
      in a hundred or so, state (FingerState)
 
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from piezo_control.feedback import read_controller
+from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
@@ -81,8 +82,8 @@ class ServoNode(FingerNode):
 
     def check(self, parameters: ServoNodeParameters) -> None:
         if parameters.controller_file != self.parameters.controller_file or not self.active:
-            controller = read_controller(parameters.controller_file)
-            self._check_delay(controller.delay_samples, parameters)
+            controller = self._controller(parameters.controller_file)
+            self._check_delay(controller, parameters)
             if self.servo and controller.sample_time != self.servo.sample_time:
                 raise ParameterError(
                     f"'controller_file' is '{parameters.controller_file}', made for "
@@ -90,31 +91,34 @@ class ServoNode(FingerNode):
                     f"'{self.NAME}' first"
                 )
 
-    def _check_delay(self, designed: int, p: ServoNodeParameters) -> None:
+    def _controller(self, name: str) -> FeedbackParameters:
+        return successor(name, self.servo.feedback if self.servo else FeedbackParameters())
+
+    def _check_delay(self, controller: FeedbackParameters, p: ServoNodeParameters) -> None:
         delay = p.delay_samples + (p.write == "next_edge")
-        if designed != delay:
+        if controller.controller != "none" and controller.delay_samples != delay:
             raise ParameterError(
-                f"controller '{p.controller_file}' was designed for a delay of {designed} samples, this loop "
-                f"has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"
+                f"controller '{p.controller_file}' was designed for a delay of {controller.delay_samples} "
+                f"samples, this loop has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"
             )
 
     def start(self) -> None:
         p = self.parameters
-        controller = read_controller(p.controller_file)
-        if controller.controller != "none":
-            self._check_delay(controller.delay_samples, p)
-            if not controller.certified:
-                self.get_logger().warning(
-                    f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "
-                    "that the loop is stable with this finger"
-                )
+        controller = self._controller(p.controller_file)
+        self._check_delay(controller, p)
+        if controller.controller != "none" and not controller.certified:
+            self.get_logger().warning(
+                f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "
+                "that the loop is stable with this finger"
+            )
         feedforward = read_feedforward(p)
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
         self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin)
-        self.servo.refer(self.reference.profile)
+        self.reference.restart(controller.sample_time)
+        self.servo.refer(self.reference.signal)
         self._told = self._since = time.monotonic()
         self._rates = [(self._told, 0)]
         self._errors.clear()
@@ -143,7 +147,7 @@ class ServoNode(FingerNode):
     def apply(self) -> None:
         """Let the controller of a changed `controller_file` take over."""
         if self.servo:
-            controller = read_controller(self.parameters.controller_file)
+            controller = self._controller(self.parameters.controller_file)
             if controller != self.servo.feedback:
                 self.servo.change_controller(controller)
                 self.get_logger().info(f"controller '{controller.name}' takes over")
@@ -173,7 +177,7 @@ class ServoNode(FingerNode):
 
     def _refer(self) -> None:
         if self.servo:
-            self.servo.refer(self.reference.profile)
+            self.servo.refer(self.reference.signal)
 
     def _rate(self) -> float:
         """Return how many samples a second were served lately."""

@@ -10,13 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from piezo_control.profile import Profile
+from piezo_control.profile import Profile, Signal
 from piezo_control.recording.reader import Bag, BagError, open_bag
+from piezo_control.waveform import Waveform
 
 __all__ = ["BagError", "Recording", "read"]
 
 SAMPLE_TYPE = "piezo_gripper_msgs/msg/Sample"
 PROFILE_TYPE = "piezo_gripper_msgs/msg/Profile"
+WAVEFORM_TYPE = "piezo_gripper_msgs/msg/Waveform"
 BLOCK_TYPE = "piezo_gripper_msgs/msg/SampleBlock"
 TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
 LINEAR = 1  # Profile.interpolation: straight lines
@@ -53,8 +55,8 @@ def read(
     """Read a run from a rosbag2 folder (MCAP or SQLite), or from one such storage file.
 
     Samples are brought in line by their numbers; those that a topic does not have are NaN, repeated
-    ones count once. References and tip forces are evaluated from their profile or held from set-point to
-    set-point, temperatures are held from stamp to stamp.
+    ones count once. References and tip forces are evaluated from their profile or waveform, or held from
+    set-point to set-point; temperatures are held from stamp to stamp.
 
     Parameters
     ----------
@@ -198,24 +200,27 @@ def _align(number: NDArray, samples: list[Any], stamps: NDArray) -> NDArray[np.f
 
 
 def _signal(bag: Bag, name: str, received: NDArray, elapsed: NDArray) -> NDArray[np.float64]:
-    """Evaluate a signal that came as profiles (over the time `elapsed`) and set-points: the newest counts.
+    """Evaluate a signal that came as profiles, waveforms (over the time `elapsed`) and set-points.
 
-    Each is in force from when it came, by the bag's own stamps, as are the samples (`received`, ns). A
+    The newest counts, and each is in force from when it came, by the bag's own stamps, as are the samples (`received`, ns). A
     profile that came first says what was before it, too.
     """
-    came: list[tuple[int, bool, Profile]] = []
-    for topic, kind in ((f"{name}_profile", PROFILE_TYPE), (name, SAMPLE_TYPE)):
+    came: list[tuple[int, bool, Signal]] = []
+    types = {f"{name}_profile": PROFILE_TYPE, f"{name}_waveform": WAVEFORM_TYPE, name: SAMPLE_TYPE}
+    for topic, kind in types.items():
         messages = bag.messages(topic, kind)
         for m, instant in zip(messages, bag.topics[topic].stamps if messages else ()):
             if kind == PROFILE_TYPE:
                 came.append((instant, True, Profile(m.time, m.value, m.interpolation == LINEAR)))
+            elif kind == WAVEFORM_TYPE:
+                came.append((instant, False, Waveform.of(m)))
             else:
                 came.append((instant, False, Profile([0.0], [m.value])))
     came.sort(key=lambda one: one[0])
     values = np.full(elapsed.shape, np.nan)
-    for i, (instant, is_profile, profile) in enumerate(came):
+    for i, (instant, is_profile, signal) in enumerate(came):
         first = 0 if i == 0 and is_profile else int(np.searchsorted(received, instant))
-        values[first:] = profile.at(elapsed[first:])
+        values[first:] = signal.at(elapsed[first:])
     return values
 
 

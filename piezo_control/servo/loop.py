@@ -21,7 +21,7 @@ from piezo_control.compiled import compiled
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError
-from piezo_control.profile import Profile
+from piezo_control.profile import Profile, Signal
 from piezo_control.safety import FAULT, NORMAL, RAMPING
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
 from piezo_control.servo.driver import FAILED, FRESH, Driver
@@ -300,9 +300,9 @@ class Servo:
         """Number of the last sample, -1 before the first."""
         return int(self._loop.clock.number[0])
 
-    def refer(self, profile: Profile) -> None:
+    def refer(self, signal: Signal) -> None:
         """Follow a reference (m over s since sample 0) from a few samples ahead of the present one on."""
-        self._profile = profile
+        self._signal = signal
         self._lay_out(self.number + MARGIN if self.is_running else 0)
 
     def look_ahead(self) -> None:
@@ -315,7 +315,7 @@ class Servo:
         if last <= first:
             return
         numbers = np.arange(max(first, last - len(ring.values) // 2), last)
-        ring.values[numbers % len(ring.values)] = self._profile.at(numbers * self.sample_time)
+        ring.values[numbers % len(ring.values)] = self._signal.at(numbers * self.sample_time)
         ring.until[0] = last
 
     def samples(self) -> Samples:

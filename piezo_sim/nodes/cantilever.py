@@ -2,7 +2,7 @@
 """The simulated piezocantilever with its amplifier and sensor: the block H_s·D(s) + b of the paper.
 
 in:  voltage (Sample, V), temperature (sensor_msgs/Temperature, °C),
-     tip_force (Sample, N: one value), tip_force_profile (Profile, N)
+     tip_force (Sample, N: one value), tip_force_profile (Profile, N), tip_force_waveform (Waveform, N)
 out: deflection (Sample, m), clock (rosgraph_msgs/Clock), state (FingerState)
 
 In lock-step it is the master of time: it publishes deflection k, moves on when voltage k is there, and

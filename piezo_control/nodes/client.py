@@ -1,0 +1,462 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running fingers and grippers from Python, without a node of one's own and without the `ros2` command.
+
+    from piezo_control.nodes.client import connect
+    from piezo_control.waveform import Waveform
+
+    with connect() as ros:
+        finger = ros.finger("finger")
+        finger.set(10e-6)
+        finger.wait_for(lambda: abs(finger.newest().deflection - 10e-6) < 0.2e-6)
+        finger.wave(Waveform("sine", amplitude=5e-6, frequency=2.0, offset=10e-6))
+
+Every call returns when the nodes have answered, or raises ClientError with a sentence that says what did not
+answer or what was refused. Signals are not received one by one: `newest` takes the last sample of each when it is
+asked for, so looking at a loop of thousands of samples a second costs neither it nor the caller anything.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
+
+from piezo_control.nodes.profile_input import ProfileInput, waveform_message
+from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.nodes.spin import LONGEST_WAIT
+from piezo_control.safety import LARGEST_DEFLECTION
+from piezo_control.waveform import Waveform
+from piezo_gripper_msgs.action import Grip
+from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
+from piezo_gripper_msgs.msg import Waveform as WaveformMessage
+
+LOOK_PERIOD = 0.02  # s, between two looks at something that is waited for
+LEAD_TIME = 0.1  # s of the finger's time from sending a waveform to its start
+LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+STATE_TYPE = "piezo_gripper_msgs/msg/FingerState"
+CHANGE_STATE = "/change_state"
+FOLLOWERS = ("feedback", "servo")
+"""Nodes that follow a reference."""
+STOPPERS = ("servo", "cantilever", "feedforward")
+"""Nodes that bring the voltage to rest when they are deactivated; the first that is there does."""
+TRANSITIONS = {
+    "configure": Transition.TRANSITION_CONFIGURE,
+    "activate": Transition.TRANSITION_ACTIVATE,
+    "deactivate": Transition.TRANSITION_DEACTIVATE,
+    "cleanup": Transition.TRANSITION_CLEANUP,
+}
+PHASES = {
+    FingerState.IDLE: "idle",
+    FingerState.WAITING: "waiting",
+    FingerState.RUNNING: "running",
+    FingerState.FINISHED: "finished",
+    FingerState.FAULT: "fault",
+    FingerState.HOLDING: "holding",
+    FingerState.RAMPING: "ramping to rest",
+}
+
+
+class ClientError(RuntimeError):
+    """What was asked for was not done; the message says why."""
+
+
+class Reading(NamedTuple):
+    """The newest of a finger's signals, NaN for what nobody publishes."""
+
+    time: float
+    """s since sample 0, in the finger's own time."""
+    reference: float
+    """m; of those that came since this client began."""
+    deflection: float
+    """m"""
+    command: float
+    """m"""
+    voltage: float
+    """V"""
+    temperature: float
+    """°C"""
+    tip_force: float
+    """N"""
+
+
+class Newest:
+    """The newest message of a topic, taken when it is asked for; belongs to a node that nobody spins."""
+
+    def __init__(self, node: Node, kind: type, topic: str) -> None:
+        self._subscription = node.create_subscription(kind, topic, lambda _: None, LATEST)
+        self._last: Any = None
+
+    def __call__(self) -> Any:
+        """Return the message; None before the first."""
+        s = self._subscription
+        with s.handle:
+            taken = s.handle.take_message(s.msg_type, s.raw)
+        if taken is not None:
+            self._last = taken[0]
+        return self._last
+
+
+class Ros:
+    """A connection to the nodes of this ROS domain; made by :func:`connect`."""
+
+    def __init__(self, node: Node, watcher: Node, timeout: float) -> None:
+        self.node = node
+        self.watcher = watcher
+        self.timeout = timeout
+        self.diagnostics: dict[str, DiagnosticStatus] = {}
+        """The newest of each node, by its full name."""
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
+
+    def finger(self, namespace: str = "") -> Finger:
+        """Return the finger in a namespace, or, when none is named, the only one that is there."""
+        if namespace:
+            return Finger(self, "/" + namespace.strip("/"))
+        self.wait(lambda: bool(self.fingers()), lambda: "no finger is running in this ROS domain")
+        found = self.fingers()
+        if len(found) > 1:
+            raise ClientError(f"there are several fingers, name one of {', '.join(found)}")
+        return Finger(self, found[0])
+
+    def fingers(self) -> list[str]:
+        """Return the namespaces of the fingers that are there."""
+        topics = self.node.get_topic_names_and_types()
+        return sorted(
+            topic.removesuffix("/state") or "/"
+            for topic, types in topics
+            if topic.endswith("/state")
+            and STATE_TYPE in types
+            and self.node.count_publishers(topic)
+        )
+
+    def nodes(self) -> list[str]:
+        """Return the full names of the nodes that have a lifecycle."""
+        return sorted(
+            name.removesuffix(CHANGE_STATE)
+            for name, types in self.node.get_service_names_and_types()
+            if "lifecycle_msgs/srv/ChangeState" in types and name.endswith(CHANGE_STATE)
+        )
+
+    def lifecycle(self, node: str, transition: str = "") -> str:
+        """Take a node through a transition, if one is named, and return the state that it is in.
+
+        Raises ClientError for a transition that the node refuses, with what it says on `/diagnostics`.
+        """
+        if transition:
+            if transition not in TRANSITIONS:
+                raise ClientError(
+                    f"transition is '{transition}', must be one of {', '.join(TRANSITIONS)}"
+                )
+            request = ChangeState.Request(transition=Transition(id=TRANSITIONS[transition]))
+            if not self.call(ChangeState, f"{node}{CHANGE_STATE}", request).success:
+                raise ClientError(
+                    f"'{node}' refuses to {transition}: it is {self.lifecycle(node)}; its log says why"
+                )
+        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+
+    def parameters(self, node: str) -> dict[str, Any]:
+        """Return all parameters of a node."""
+        client = AsyncParameterClient(self.node, node)
+        self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
+        names = sorted(self.result(client.list_parameters([], 0), node).result.names)
+        values = self.result(client.get_parameters(names), node).values
+        return dict(zip(names, map(parameter_value_to_python, values), strict=True))
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
+        client = AsyncParameterClient(self.node, node)
+        self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
+        changes = [Parameter(name, value=value) for name, value in values.items()]
+        result = self.result(client.set_parameters_atomically(changes), node).result
+        if not result.successful:
+            raise ClientError(f"'{node}' refuses: {result.reason}")
+
+    def grip(
+        self,
+        opening: float,
+        max_force: float = 0.0,
+        speed: float = 0.0,
+        gripper: str = "/grip",
+        on_feedback: Callable[[Grip.Feedback], None] = lambda _: None,
+        timeout: float = 120.0,
+    ) -> Grip.Result:
+        """Bring the fingers of a gripper to an opening, or stop at a force; return how it ended.
+
+        Parameters
+        ----------
+        opening, max_force, speed : m, N and m/s; 0 for force and speed: the gripper's own
+        gripper : the name of its action
+        on_feedback : called with opening and force on the way
+        timeout : s; when it is over the goal is canceled, and the fingers hold where they are
+        """
+        client = ActionClient(self.node, Grip, gripper)
+        try:
+            self.wait(client.server_is_ready, lambda: f"no gripper answers on '{gripper}'")
+            goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
+            handle = self.result(
+                client.send_goal_async(goal, lambda message: on_feedback(message.feedback)), gripper
+            )
+            if not handle.accepted:
+                raise ClientError(f"the gripper refuses this goal; its log on '{gripper}' says why")
+            try:
+                return self.result(handle.get_result_async(), gripper, timeout).result
+            except BaseException:
+                handle.cancel_goal_async()
+                raise
+        finally:
+            client.destroy()
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """Return the answer of a service."""
+        client = self.node.create_client(kind, service)
+        try:
+            self.wait(client.service_is_ready, lambda: f"nobody serves '{service}'")
+            return self.result(client.call_async(request), service)
+        finally:
+            self.node.destroy_client(client)
+
+    def result(self, future: Future, who: str, timeout: float = 0.0) -> Any:
+        """Return what a future comes to."""
+        limit = timeout or self.timeout
+        done = threading.Event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(limit):
+            raise ClientError(f"'{who}' has not answered for {limit:g} s")
+        return future.result()
+
+    def wait(self, condition: Callable[[], bool], otherwise: Callable[[], str]) -> None:
+        """Return when `condition` holds; after the time limit ClientError with the words of `otherwise`."""
+        end = time.monotonic() + self.timeout
+        while not condition():
+            if time.monotonic() > end:
+                raise ClientError(f"{otherwise()} (waited {self.timeout:g} s)")
+            time.sleep(LOOK_PERIOD)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.diagnostics.update({status.name: status for status in message.status})
+
+
+class Finger:
+    """A finger, simulated or real, in a namespace such as '/finger'; made by :meth:`Ros.finger`."""
+
+    def __init__(self, ros: Ros, namespace: str) -> None:
+        self.ros = ros
+        self.namespace = namespace
+        self.prefix = namespace.rstrip("/") + "/"
+        self.state: FingerState | None = None
+        """The newest state; None before the first."""
+        node, watcher = ros.node, ros.watcher
+        node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
+        # Which frequencies its loop can follow the finger says, so here any sample time will do.
+        self._reference = ProfileInput(node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION)
+        self._set_points = node.create_publisher(Sample, f"{self.prefix}reference", SETPOINT)
+        self._waveforms = node.create_publisher(
+            WaveformMessage, f"{self.prefix}reference_waveform", SETPOINT
+        )
+        self._samples = {
+            name: Newest(watcher, Sample, f"{self.prefix}{name}")
+            for name in ("deflection", "command", "voltage")
+        }
+        self._temperature = Newest(watcher, Temperature, f"{self.prefix}temperature")
+        self._recorder = Newest(watcher, RecorderState, f"{self.prefix}recorder_state")
+
+    def nodes(self) -> list[str]:
+        """Return the full names of the finger's nodes."""
+        return [n for n in self.ros.nodes() if n.rpartition("/")[0] + "/" == self.prefix]
+
+    def newest(self) -> Reading:
+        """Return the newest sample of every signal."""
+        deflection = self._samples["deflection"]()
+        nan = float("nan")
+        state = self.state
+        elapsed = deflection.number * deflection.period if deflection else nan
+        values = {name: getattr(take(), "value", nan) for name, take in self._samples.items()}
+        return Reading(
+            time=elapsed,
+            reference=float(self._reference.signal.at(elapsed)) if deflection else nan,
+            temperature=getattr(
+                self._temperature(), "temperature", state.temperature if state else nan
+            ),
+            tip_force=state.tip_force if state else nan,
+            **values,
+        )
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        """Return when `condition` holds; ClientError with the finger's state when it does not in time."""
+        self.ros.wait(condition, lambda: f"'{self.namespace}' is {self.words()}")
+
+    def words(self) -> str:
+        """Return in words what the finger does."""
+        if self.state is None:
+            others = ", ".join(self.ros.fingers()) or "none"
+            return f"silent: nothing on '{self.prefix}state'; fingers that are there: {others}"
+        text = f": {self.state.text}" if self.state.text else ""
+        return f"{PHASES[self.state.phase]}{text}"
+
+    # --- the reference ------------------------------------------------------------------------------
+
+    def set(self, deflection: float) -> None:
+        """Let the finger go to a deflection (m) and stay there."""
+        if not abs(deflection) <= LARGEST_DEFLECTION:
+            raise ClientError(
+                f"deflection is {deflection:g} m, must be within ±{LARGEST_DEFLECTION:g} m: metres?"
+            )
+        self._send(self._set_points, Sample(value=deflection))
+
+    def zero(self) -> None:
+        """Let the finger go to a deflection of 0 and stay there."""
+        self.set(0.0)
+
+    def wave(self, waveform: Waveform) -> None:
+        """Let the finger follow a waveform (m), from a tenth of a second ahead; its own `start` is not used.
+
+        ClientError where the finger does not run, as then there is no time to start from.
+        """
+        if not waveform.largest <= LARGEST_DEFLECTION:
+            raise ClientError(
+                f"the waveform goes up to {waveform.largest:g} m, must be within ±{LARGEST_DEFLECTION:g} m"
+            )
+        self.wait_for(lambda: self.newest().time >= 0.0)
+        message = waveform_message(waveform)
+        message.start = self.newest().time + LEAD_TIME
+        self._send(self._waveforms, message)
+
+    def _send(self, publisher: Any, message: Any) -> None:
+        """Publish to a node that follows references, and see that it arrives."""
+
+        def followers() -> list[str]:
+            found = self.ros.node.get_subscriptions_info_by_topic(publisher.topic_name)
+            return [one.node_name for one in found if one.node_name in FOLLOWERS]
+
+        self.ros.wait(
+            lambda: (
+                bool(followers()) and publisher.get_subscription_count() >= len(followers()) + 1
+            ),
+            lambda: f"nobody follows '{publisher.topic_name}': {self.words()}",
+        )
+        publisher.publish(message)
+        publisher.wait_for_all_acked(Duration(seconds=self.ros.timeout))
+
+    # --- the loop -----------------------------------------------------------------------------------
+
+    def node(self, *names: str) -> str:
+        """Return the full name of the first of these nodes that is there."""
+
+        def found() -> list[str]:
+            return [self.prefix + name for name in names if self.prefix + name in self.nodes()]
+
+        self.ros.wait(
+            lambda: bool(found()),
+            lambda: (
+                f"'{self.namespace}' has no node {' or '.join(map(repr, names))}; it has "
+                f"{', '.join(self.nodes()) or 'none'}"
+            ),
+        )
+        return found()[0]
+
+    def control(self, controller: str) -> None:
+        """Let another controller take over: a shipped name, the path of a file, or 'none': open loop."""
+        self.ros.set_parameters(self.node(*FOLLOWERS), {"controller_file": controller})
+
+    def stop(self) -> None:
+        """Bring the voltage to rest, where it stays until `start`."""
+        self.ros.lifecycle(self.node(*STOPPERS), "deactivate")
+
+    def start(self) -> None:
+        """Let a stopped finger run again; its reference is that of before."""
+        self.ros.lifecycle(self.node(*STOPPERS), "activate")
+
+    def reset(self) -> dict[str, str]:
+        """Leave latched faults; return what each node says. ClientError if one of them cannot.
+
+        The finger itself comes last, since its first sample has to be answered by all the others.
+        """
+        nodes = sorted(self.nodes(), key=lambda name: name.endswith(STOPPERS[:2]))
+        if not nodes:
+            raise ClientError(f"'{self.namespace}' is {self.words()}")
+        answers = {n: self.ros.call(Trigger, f"{n}/reset", Trigger.Request()) for n in nodes}
+        refused = [f"'{n}' cannot reset: {a.message}" for n, a in answers.items() if not a.success]
+        if refused:
+            raise ClientError("; ".join(refused))
+        return {name: answer.message for name, answer in answers.items()}
+
+    # --- the recorder -------------------------------------------------------------------------------
+
+    def record(self, bag: str = "") -> str:
+        """Let the recorder begin a bag, and return its folder; empty: one named by the time.
+
+        The folder is on the recorder's machine, relative to where it was started.
+        """
+        recorder = self.node("recorder")
+        if self.ros.lifecycle(recorder) == "active":
+            raise ClientError(f"'{recorder}' is recording already")
+        self.ros.set_parameters(recorder, {"bag": bag})
+        if self.ros.lifecycle(recorder) == "unconfigured":
+            self.ros.lifecycle(recorder, "configure")
+        self.ros.lifecycle(recorder, "activate")
+        self.wait_for(lambda: bool(self._recorder() and self._recorder().bag))
+        return self._recorder().bag
+
+    def end_record(self) -> None:
+        """Let the recorder finish its bag."""
+        recorder = self.node("recorder")
+        self.ros.lifecycle(recorder, "deactivate")
+        self.ros.lifecycle(recorder, "cleanup")
+
+    def _on_state(self, state: FingerState) -> None:
+        self.state = state
+
+
+@contextmanager
+def connect(timeout: float = 10.0) -> Iterator[Ros]:
+    """Return a connection to the nodes of this ROS domain; `timeout` (s) holds for every answer."""
+    context = Context()
+    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    node, watcher = (
+        rclpy.create_node(
+            f"{name}_{os.getpid()}",
+            context=context,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
+        for name in ("client", "watcher")
+    )
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    done = threading.Event()
+
+    def spin() -> None:
+        while not done.is_set():
+            executor.spin_once(timeout_sec=LONGEST_WAIT)
+
+    thread = threading.Thread(target=spin, name="client", daemon=True)
+    thread.start()
+    try:
+        yield Ros(node, watcher, timeout)
+    finally:
+        done.set()
+        thread.join()
+        executor.shutdown()
+        watcher.destroy_node()
+        node.destroy_node()
+        context.try_shutdown()
