@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import os
+import sys
 from glob import glob
-from os.path import dirname, join
+from os.path import basename, dirname, exists, join, realpath
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.build_ext import build_ext
 
 NAME = "piezo_gripper"
 DESCRIPTION = glob("description/*.*") + glob("description/config/*")
@@ -12,6 +15,22 @@ PARAMS = [path for path in glob("params/**", recursive=True) if path.endswith(("
 def shared(paths):
     """Install each path below share/piezo_gripper, in the folder it has here."""
     return [(join("share", NAME, dirname(path)), [path]) for path in sorted(paths)]
+
+
+class BuildWithMessages(build_ext):
+    """Refuses to build where ROS is, but not the messages: nothing would say so before a node starts."""
+
+    def run(self):
+        prefixes = list(filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
+        messages = f"{NAME}_msgs"
+        if prefixes and not any(exists(join(p, "share", messages)) for p in prefixes):
+            root = dirname(realpath(__file__))
+            sys.exit(
+                f"{NAME}: the package {messages} is not there. It is in this package, where colcon and rosdep do not "
+                f"look; put a link beside it and build again:\n"
+                f"  ln -s {basename(root)}/msg_defs {join(dirname(root), messages)}"
+            )
+        super().run()
 
 
 setup(
@@ -24,6 +43,7 @@ setup(
     license="Apache-2.0",
     packages=find_packages(include=["piezo_control*", "piezo_sim*"]),
     package_data={"": ["*.html", "*.j2", "*.css", "*.h"]},
+    cmdclass={"build_ext": BuildWithMessages},
     ext_modules=[  # plain shared libraries, drivers of the servo
         Extension(f"piezo_control.servo.drivers.{name}", [f"piezo_control/servo/drivers/{name}.c"])
         for name in ("iio", "udp")

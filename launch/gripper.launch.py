@@ -12,7 +12,7 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
-FINGERS = ("left", "right")
+FINGERS = ("left", "right")  # the default of the gripper node; lists do not pass launch whole
 ARGUMENTS = {
     "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
     "joint_states": (
@@ -46,12 +46,7 @@ def generate_launch_description() -> LaunchDescription:
             Node(
                 package="piezo_gripper",
                 executable="gripper",
-                parameters=[
-                    {
-                        "fingers": list(FINGERS),
-                        "sample_time": LaunchConfiguration("sample_time"),
-                    },
-                ],
+                parameters=[{"sample_time": LaunchConfiguration("sample_time")}],
                 remappings=[joint_states],
                 output="screen",
             ),

@@ -5,6 +5,8 @@ import ast
 import importlib.metadata
 import os
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -144,3 +146,14 @@ def test_every_message_survives_serialization():
         message.header.frame_id = "finger"
         message.header.stamp.sec = 7
         assert deserialize_message(serialize_message(message), type(message)) == message
+
+
+def test_a_build_without_the_messages_says_what_to_type(tmp_path):
+    build = subprocess.run(
+        [sys.executable, "setup.py", "build_ext", "--build-temp", tmp_path, "--build-lib", tmp_path],
+        cwd=ROOT, env={**os.environ, "AMENT_PREFIX_PATH": str(tmp_path)}, capture_output=True, text=True,
+        timeout=300,
+    )  # fmt: skip
+    assert build.returncode == 1
+    line = f"ln -s {ROOT.name}/msg_defs {ROOT.parent / 'piezo_gripper_msgs'}"
+    assert build.stderr.splitlines()[-1].strip() == line
