@@ -96,6 +96,7 @@ def is_physical(value: float, largest: float) -> bool:
 
 
 NORMAL, HOLDING, RAMPING, FAULT = range(4)
+PHASES = ("normal", "holding", "ramping", "fault")
 
 
 class Guard:
@@ -134,12 +135,13 @@ class Guard:
             self.heard = now
             self.phase = NORMAL
             self.cause = ""
+            self.since = math.nan
 
-    def trip(self, cause: str, now: float) -> None:
-        """Latch a fault; the first cause is kept."""
+    def trip(self, cause: str, now: float, at_rest: bool = False) -> None:
+        """Latch a fault, `at_rest` where there is no voltage to lead there; the first cause is kept."""
         self.times += 1
         if not self.is_latched:
-            self.phase = RAMPING
+            self.phase = FAULT if at_rest else RAMPING
             self.cause = cause
             self.since = now
 

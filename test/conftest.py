@@ -9,3 +9,10 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 # Small matrices only: threads of BLAS cost more than they save, above all on a busy machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_configure(config):
+    config.addinivalue_line(
+        "markers",
+        "shows(row, ...): rows of the table of faults in docs/safety.md that a test shows",
+    )

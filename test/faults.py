@@ -2,251 +2,138 @@
 """A campaign of faults on live nodes: random schedules, and what has to hold after every sample.
 
 Each schedule starts the nodes of one finger as processes, lets things go wrong in an order and at times that
-its seed decides, and watches. `python test/faults.py` runs many and prints the seeds that failed.
+its seed decides (fault_events.py), and watches (fault_bench.py, and at the plant fault_plant.py). `python
+test/faults.py` runs many, prints the seeds that failed, and goes on where it was stopped.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import math
+import functools
+import json
 import os
 import random
-import signal
+import shutil
 import subprocess
 import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-import rclpy
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.srv import SetParameters
-from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.parameter import Parameter
-from rich.progress import Progress
+import fault_bench
+import fault_events
+from fault_bench import Bench, Network
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from std_srvs.srv import Trigger
 
-from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
-from piezo_control.safety import VoltageParameters
 from piezo_gripper_msgs.msg import FingerState, Sample
-from piezo_sim.experiment.cases import params_folder
-from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
-NODES = ("feedforward", "feedback", "cantilever")
-STANDS = VoltageParameters()
-FARTHEST = (
-    66e-6  # m: where a step from one end of the reach, 22 µm, to the other overshoots to, undamped
-)
-START = 30.0  # s that the loop may take to run on a busy machine
-OUTCOME = (
-    20.0  # s until it tracks again or a fault is latched and named; reply_timeout is 2 s of them
-)
-NONSENSE = (math.nan, math.inf, -1e300, 1e6, 20.0, 5e-324)
+START = 60.0  # s that the loop may take to run on a busy machine
+OUTCOME = 30.0  # s until it tracks again or a fault is latched and named
+TARGET = 1e-5  # m
+NEAR = {True: 0.5e-6, False: 3e-6}  # m: with a controller; without, creep and warmth are not undone
+CLOSED = (FingerState.FAULT, FingerState.RAMPING)
 
-
-@dataclass
-class Bench:
-    """One finger's processes, a node beside them, and what was seen."""
-
-    lockstep: bool
-    processes: NodeProcesses
-    draw: random.Random
-    killed: set[str] = field(default_factory=set)
-    foreign: set[str] = field(default_factory=set)
-    violations: list[str] = field(default_factory=list)
-    samples: int = 0
-    number: int = -1
-    finger: FingerState = field(default_factory=FingerState)
-
-    def __post_init__(self) -> None:
-        self.node = rclpy.create_node("watcher")
-        self.executor = EventsExecutor()
-        self.executor.add_node(self.node)
-        self.node.create_subscription(FingerState, "state", self._on_state, LATCHED)
-        self.node.create_subscription(Sample, "deflection", self._on_deflection, SAMPLE)
-        self.node.create_subscription(Sample, "voltage", self._on_voltage, SAMPLE)
-        self.reference = self.node.create_publisher(Sample, "reference", SETPOINT)
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-
-    def wait(self, seconds: float, done: Callable[[], bool] = lambda: False) -> bool:
-        """Serve events until `done()` or for so many seconds; say whether it was done."""
-        end = time.monotonic() + seconds
-        while not done():
-            if time.monotonic() > end:
-                return False
-            self.executor.spin_once(timeout_sec=0.02)
-        return True
-
-    def broken(self, text: str) -> None:
-        if text not in self.violations:
-            self.violations.append(text)
-
-    def _on_state(self, state: FingerState) -> None:
-        self.finger = state
-        if not STANDS.voltage_low <= state.voltage <= STANDS.voltage_high:
-            self.broken(f"the finger had {state.voltage} V")
-        if state.phase == FingerState.FAULT and not state.text:
-            self.broken("a fault without a name")
-
-    def _on_deflection(self, sample: Sample) -> None:
-        if "deflection" in self.foreign:
-            return
-        self.samples += 1
-        if not abs(sample.value) <= FARTHEST and not self.foreign:
-            self.broken(f"the tip was at {sample.value} m")
-        if self.lockstep:
-            if self.number >= 0 and sample.number not in (0, self.number, self.number + 1):
-                self.broken(f"deflection {sample.number} after {self.number}")
-            self.number = sample.number
-
-    def _on_voltage(self, sample: Sample) -> None:
-        if "voltage" not in self.foreign and not (
-            STANDS.voltage_low <= sample.value <= STANDS.voltage_high
-        ):
-            self.broken(f"feedforward published {sample.value} V")
-
-    def call(self, kind, service: str, request) -> None:
-        """Call a service of a node that may be gone; nobody waits for the answer."""
-        client = self.node.create_client(kind, service)
-        if self.wait(1.0, client.service_is_ready):
-            client.call_async(request)
-            self.wait(0.2)
-
-
-def halt(bench: Bench) -> None:
-    process = bench.processes.running[bench.draw.choice(NODES)]
-    process.send_signal(signal.SIGSTOP)
-    bench.wait(bench.draw.choice((0.02, 0.3, 1.0)))
-    process.send_signal(signal.SIGCONT)
-
-
-def end(bench: Bench) -> None:
-    name = bench.draw.choice(NODES)
-    number = bench.draw.choice(
-        (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
-    )
-    bench.killed.add(name)
-    bench.processes.running[name].send_signal(number)
-
-
-def transition(bench: Bench) -> None:
-    """Any transition of any node, most of them impossible; at times there and back."""
-    name = bench.draw.choice(NODES)
-    numbers = bench.draw.choice(([bench.draw.choice((1, 2, 3, 4, 7, 99))], [4, 3]))
-    for number in numbers:
-        bench.killed |= {name} if number in (4, 7) else set()
-        request = ChangeState.Request(transition=Transition(id=number))
-        bench.call(ChangeState, f"{name}/change_state", request)
-
-
-def parameter(bench: Bench) -> None:
-    name, value = bench.draw.choice(
-        (
-            ("use_sim_time", True), ("voltage_high", 1e308), ("slew_limit", math.nan), ("ramp", 1e7),
-            ("sample_time", 0.01), ("d", 1e6), ("a", [math.inf]), ("controller_file", "/nowhere"),
-            ("mode", "free_running"), ("hysteresis.weights", [-1.0]), ("samples", -1), ("no", "such"),
-        )
-    )  # fmt: skip
-    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-    bench.call(SetParameters, f"{bench.draw.choice(NODES)}/set_parameters", request)
-
-
-def intrude(bench: Bench) -> None:
-    """A second publisher of a topic of the loop, with nonsense, stray numbers, or quick swings."""
-    topic = bench.draw.choice(("voltage", "command", "deflection", "reference"))
-    bench.foreign.add(topic)
-    publisher = bench.node.create_publisher(Sample, topic, SAMPLE)
-    for k in range(bench.draw.choice((1, 30))):
-        value = bench.draw.choice((*NONSENSE, 39.0 * (-1) ** k, 2e-5 * (-1) ** k))
-        number = bench.draw.choice((0, k, bench.number + 1, 2**64 - 1))
-        publisher.publish(Sample(number=max(0, number), value=value))
-        bench.wait(0.005)
-    bench.node.destroy_publisher(publisher)
-
-
-def refer(bench: Bench) -> None:
-    for _ in range(20):
-        value = bench.draw.choice((*NONSENSE, 1.7e308, -2e-5, 2e-5, 1e-5))
-        bench.reference.publish(Sample(value=value))
-        bench.wait(0.01)
-
-
-def load(bench: Bench) -> None:
-    """Both cores busy for a while."""
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
-    bench.wait(1.0)
-    for process in busy:
-        process.kill()
-        process.wait()
-
-
-EVENTS = (halt, end, transition, parameter, intrude, refer, load)
+has_networks = functools.cache(fault_bench.may_make_networks)
 
 
 @contextlib.contextmanager
-def finger(seed: int, folder: Path) -> Iterator[Bench]:
-    """Start the nodes of a finger as the seed has it."""
-    draw = random.Random(seed)
-    lockstep = draw.random() < 0.6
-    arguments = {name: ["--ros-args"] for name in NODES}
-    if lockstep:
-        arguments["feedback"] += ["--params-file", str(params_folder() / "feedback_robust.yaml")]
-    else:
-        for words in arguments.values():
-            words += ["-p", "mode:=free_running", "-p", "sample_time:=0.005"]
-    rclpy.init()
+def burners(count: int):
+    """Keep so many cores busy."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
     try:
-        with NodeProcesses(arguments, folder) as processes:
-            bench = Bench(lockstep, processes, draw)
-            try:
-                yield bench
-            finally:
-                bench.close()
+        yield
     finally:
-        rclpy.shutdown()
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def run_schedule(seed: int, folder: Path) -> list[str]:
     """Run one schedule; return what was violated, an empty list if nothing."""
-    with finger(seed, folder) as bench:
-        moving = 200 if bench.lockstep else 20
-        if not bench.wait(START, lambda: bench.samples > moving):
-            return ["the loop did not begin to run"]
-        bench.reference.publish(Sample(value=1e-5))
-        for _ in range(bench.draw.randint(1, 3)):
-            bench.wait(bench.draw.uniform(0.0, 0.3))
-            bench.draw.choice(EVENTS)(bench)
-        for name, process in bench.processes.running.items():
-            if process.poll() is not None and name not in bench.killed:
-                bench.broken(f"{name} ended ({process.returncode})")
-        before = bench.finger.samples
-
-        def is_decided() -> bool:
-            if "cantilever" in bench.killed:
-                return True
-            is_running = bench.finger.phase == FingerState.RUNNING
-            return is_running and bench.finger.samples > before + moving or bench.finger.phase in (
-                FingerState.FAULT, FingerState.IDLE, FingerState.WAITING,
-            )  # fmt: skip
-
-        if not bench.wait(OUTCOME, is_decided):
-            bench.broken(f"undecided: phase {bench.finger.phase}, '{bench.finger.text}'")
+    draw = random.Random(seed)
+    lockstep = draw.random() < 0.6
+    linked = draw.choice(("", "", "deflection", "command", "voltage"))
+    misfit = bool(linked) and draw.random() < 0.1
+    is_loaded = draw.random() < 0.3
+    is_apart = not linked and draw.random() < 0.2  # drawn alike on every machine
+    with contextlib.ExitStack() as stack:
+        network = stack.enter_context(Network()) if is_apart and has_networks() else None
+        bench = stack.enter_context(
+            fault_bench.finger(lockstep, linked, misfit, network, draw, folder)
+        )
+        if misfit:
+            has_ended = bench.wait(START, lambda: bench.finger.phase in CLOSED)
+            if not (has_ended and "RELIABILITY" in bench.finger.text):
+                bench.broken(f"no fault names the quality of service: '{bench.finger.text}'")
+        else:
+            let_go_wrong(bench, 2 * is_loaded)
         violations = bench.violations
         processes = dict(bench.processes.running)
+        finger = bench.finger
     violations += [f"{n} is left behind" for n, p in processes.items() if p.poll() is None]
-    for path in folder.glob("*.log"):
-        words = path.read_text(errors="replace")
+    logs = {path.stem: path.read_text(errors="replace") for path in folder.glob("*.log")}
+    for name, words in logs.items():
         if "Traceback" in words:
-            violations.append(f"{path.stem}: {words.strip().splitlines()[-1]}")
+            violations.append(f"{name}: {words.strip().splitlines()[-1]}")
+        violations += [f"{name}: {x}" for x in words.splitlines() if x.startswith("VIOLATED")][:3]
+    everything = "\n".join(logs.values())
+    violations += [f"no log says '{words}'" for words in bench.missing if words not in everything]
+    if finger.phase == FingerState.FAULT and finger.text.split(": ")[-1] not in everything:
+        violations.append(f"no log says '{finger.text}'")
     return violations
+
+
+def let_go_wrong(bench: Bench, cores: int) -> None:
+    """Wait for the loop, let one to three things happen to it, with `cores` busy, and see how it ends."""
+    moving = 200 if bench.lockstep else 20
+
+    def is_running() -> bool:
+        if (
+            bench.finger.phase == FingerState.FAULT
+        ):  # of a machine that is too busy for its time limits
+            bench.call(Trigger, "cantilever/reset", Trigger.Request())
+        return bench.samples > moving
+
+    if not bench.wait(START, is_running):
+        bench.broken(f"the loop did not begin to run: '{bench.finger.text}'")
+        return
+    kinds = [*fault_events.ALWAYS]
+    kinds += [fault_events.disturb] * 5 if bench.link else []
+    kinds += [fault_events.cut] * 10 if bench.processes.network else []
+    chosen = bench.draw.choices(kinds, k=bench.draw.randint(1, 3))
+    bench.reference.publish(Sample(value=TARGET))
+    with burners(cores):
+        for happen in chosen:
+            bench.wait(bench.draw.uniform(0.0, 0.3))
+            happen(bench)
+    if len(chosen) > 1 or bench.ended:
+        bench.missing.clear()  # after another event nobody may be left to say it
+    for name, process in bench.processes.running.items():
+        if process.poll() is not None and name not in bench.ended:
+            bench.broken(f"{name} ended ({process.returncode})")
+    before = bench.finger.samples
+    bench.node.create_timer(0.2, lambda: bench.reference.publish(Sample(value=TARGET)))
+
+    def is_decided() -> bool:
+        state = bench.finger
+        if state.phase == FingerState.FAULT:
+            return bool(state.text)
+        if (
+            bench.ended
+        ):  # what was told to end may leave a finger that is at rest or waits for it, by name
+            if "cantilever" in bench.ended or state.phase == FingerState.WAITING and state.text:
+                return True
+        is_near = abs(state.deflection - TARGET) < NEAR[bench.lockstep]
+        is_new = state.samples > before + moving or state.samples < before
+        return state.phase == FingerState.RUNNING and is_new and is_near
+
+    if not bench.wait(OUTCOME, is_decided):
+        s = bench.finger
+        bench.broken(
+            f"undecided: phase {s.phase}, sample {s.samples}, {s.deflection * 1e6:.2f} µm, '{s.text}'"
+        )
 
 
 def main() -> int:
@@ -254,15 +141,41 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--schedules", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0, help="of the first schedule")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/faults"),
+        help="folder for results.jsonl, where schedules count as done, and the logs of those that failed",
+    )  # fmt: skip
     arguments = parser.parse_args()
-    failed = {}
-    with Progress() as progress, tempfile.TemporaryDirectory() as folder:
-        seeds = range(arguments.seed, arguments.seed + arguments.schedules)
-        for seed in progress.track(seeds, description="schedules"):
-            if violations := run_schedule(seed, Path(folder) / str(seed)):
-                failed[seed] = violations
-                progress.console.print(f"seed {seed}: {'; '.join(violations)}", soft_wrap=True)
-    print(f"{arguments.schedules} schedules, {len(failed)} with violations {list(failed) or ''}")
+    out: Path = arguments.out
+    out.mkdir(parents=True, exist_ok=True)
+    results = out / "results.jsonl"
+    lines = results.read_text().splitlines() if results.exists() else []
+    done = {line["seed"]: line["violations"] for line in map(json.loads, lines)}
+    seeds = range(arguments.seed, arguments.seed + arguments.schedules)
+    if not has_networks():
+        print("no rights to make network namespaces: no link between two networks is cut")
+    columns = (
+        TextColumn("schedules"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[failed]} failed"),
+    )  # fmt: skip
+    with Progress(*columns) as progress, results.open("a") as stream:
+        task = progress.add_task("", total=len(seeds), failed=0)
+        for seed in seeds:
+            if seed not in done:
+                folder = out / str(seed)
+                done[seed] = run_schedule(seed, folder)
+                stream.write(json.dumps({"seed": seed, "violations": done[seed]}) + "\n")
+                stream.flush()
+                if done[seed]:
+                    text = f"seed {seed}: {'; '.join(done[seed])}"
+                    progress.console.print(text, soft_wrap=True, markup=False)
+                else:
+                    shutil.rmtree(folder)
+            progress.update(task, advance=1, failed=sum(bool(done[s]) for s in seeds if s in done))
+    failed = [seed for seed in seeds if done[seed]]
+    print(f"{len(seeds)} schedules, {len(failed)} with violations {failed or ''}")
+    for seed in failed:
+        print(f"again: python test/faults.py --schedules 1 --seed {seed} --out /tmp/again")
     return 1 if failed else 0
 
 

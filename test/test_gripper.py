@@ -317,6 +317,7 @@ def test_new_goal_takes_over_and_the_old_one_is_aborted(bench):
     assert "a new goal takes over" in bench.log.read_text()
 
 
+@pytest.mark.shows("a gripper that is gone")
 def test_a_killed_gripper_leaves_fingers_that_stop(bench):
     bench.send(10e-6, 0.0, 5e-6)  # 6 s to go
     bench.wait(lambda: all(s.deflection > 1e-6 for s in bench.states.values()))

@@ -16,14 +16,16 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
+from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
-from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE, SETPOINT
+from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 from piezo_sim.experiment.cases import params_folder
+from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 __all__ = ["neighbour"]  # a fixture of the module above
 SLEW = 4e4 * 1e-4  # V: default slew limit times sample time
@@ -85,6 +87,7 @@ def test_silence_ends_at_rest_and_stays_there_until_a_reset(neighbour, tmp_path,
     )  # the ramp, 1e4 V/s, per ms; the slew limit is 4 V a sample
 
 
+@pytest.mark.shows("deactivation, shutdown, SIGINT, SIGTERM, SIGHUP, SIGQUIT")
 @pytest.mark.parametrize("end", ["deactivation", "SIGTERM", "SIGHUP", "SIGQUIT"])
 def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
     with node("feedforward", tmp_path) as processes:
@@ -118,6 +121,7 @@ def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighb
     assert abs(voltages[0].value - 36.9) <= SLEW * (1 + 1e-9)
 
 
+@pytest.mark.shows("two publishers of an input")
 def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
     with node("feedforward", tmp_path, mode="free_running"):
         voltages = neighbour.listen(Sample, "voltage")
@@ -134,6 +138,54 @@ def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
         assert stream
 
 
+@pytest.mark.shows("a fault of a block")
+def test_the_fault_of_a_block_is_one_of_the_finger_and_stays_until_both_are_reset(
+    neighbour, tmp_path
+):
+    before = time.time()
+    arguments = {
+        "feedback": ["--ros-args"],
+        "cantilever": ["--ros-args", "-p", "reply_timeout:=600.0"],
+    }
+    with NodeProcesses(arguments, tmp_path):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        commands = neighbour.listen(Sample, "command")
+        voltage = neighbour.publisher("voltage")
+        neighbour.wait(lambda: commands)
+        neighbour.insist(voltage, sample(0, 20.0), lambda: commands[-1].number == 1)
+        second = neighbour.node.create_publisher(Sample, "deflection", SAMPLE)
+        neighbour.wait(lambda: states[-1].phase == FingerState.FAULT)
+        told = states[-1]
+        assert told.text.startswith("feedback: '/deflection' has 2 publishers: ")
+        assert told.voltage == 0.0 and told.times >= 1
+        assert before - 1.0 <= told.since.sec + told.since.nanosec * 1e-9 <= time.time()
+        answer = reset(neighbour, "cantilever")
+        assert not answer.success and answer.message == told.text
+        neighbour.node.destroy_publisher(second)
+        neighbour.wait(lambda: reset(neighbour, "feedback").success)
+        neighbour.wait(lambda: reset(neighbour, "cantilever").success)
+        neighbour.wait(lambda: states[-1].phase == FingerState.WAITING)
+        assert states[-1].since.sec == states[-1].times == 0
+
+
+@pytest.mark.shows("a publisher of an input that cannot be heard (quality of service)")
+def test_a_publisher_that_cannot_be_heard_is_named(neighbour, tmp_path):
+    """Best effort, as sensors often publish, where reliable is asked for: nothing would ever arrive."""
+    with node("feedback", tmp_path):
+        faults = neighbour.listen(Fault, "fault", FAULTS)
+        unfit = neighbour.node.create_publisher(Sample, "deflection", qos_profile_sensor_data)
+        neighbour.wait(lambda: faults and faults[-1].text)
+        assert faults[-1].text == (
+            "'/deflection' is published by /neighbour with another RELIABILITY than RELIABLE, "
+            "which is asked for"
+        )
+        assert faults[-1].node == "feedback"
+        neighbour.node.destroy_publisher(unfit)
+        neighbour.wait(lambda: reset(neighbour, "feedback").success)
+        neighbour.wait(lambda: faults[-1].text == "")
+
+
+@pytest.mark.shows("an impossible lifecycle transition")
 def test_an_impossible_transition_is_answered_with_no(neighbour, tmp_path):
     with node("feedback", tmp_path) as processes:
         assert not neighbour.change_state("feedback", Transition.TRANSITION_CONFIGURE)
@@ -146,6 +198,7 @@ def test_an_impossible_transition_is_answered_with_no(neighbour, tmp_path):
     assert "Traceback" not in (tmp_path / "feedback.log").read_text()
 
 
+@pytest.mark.shows("samples at another sample time than the node's", "samples of the other mode")
 @pytest.mark.parametrize(
     "fields, words",
     [
@@ -170,6 +223,7 @@ def test_samples_of_another_loop_are_refused_by_name(neighbour, tmp_path, fields
     assert commands == []
 
 
+@pytest.mark.shows("a sample older than `age_limit`")
 def test_an_old_sample_is_not_acted_upon(neighbour, tmp_path):
     with node("feedforward", tmp_path, mode="free_running") as processes:
         voltages = neighbour.listen(Sample, "voltage")
@@ -187,6 +241,7 @@ def log(folder, name):
     return (folder / f"{name}.log").read_text()
 
 
+@pytest.mark.shows("a stray sample number")
 def test_a_stray_number_does_not_stop_the_count(neighbour, tmp_path):
     with node("feedback", tmp_path):
         commands = neighbour.listen(Sample, "command")
@@ -198,6 +253,7 @@ def test_a_stray_number_does_not_stop_the_count(neighbour, tmp_path):
         neighbour.wait(lambda: commands[-1].number == 1)
 
 
+@pytest.mark.shows("a value that is not finite or that no finger reaches")
 @pytest.mark.parametrize("nonsense", [1.7e308, 20.0, math.inf, math.nan])
 def test_a_reference_that_no_finger_reaches_is_refused(neighbour, tmp_path, nonsense):
     with node("feedback", tmp_path, "feedback_robust.yaml"):
@@ -210,8 +266,7 @@ def test_a_reference_that_no_finger_reaches_is_refused(neighbour, tmp_path, nons
             sample(0, 0.0),
             lambda: commands and "'reference' ignored" in log(tmp_path, "feedback"),
         )
-        reference.publish(sample(0, 1e-6))
-        assert reference.wait_for_all_acked()
+        neighbour.tell("feedback", reference, sample(0, 1e-6))
         for number in range(1, 40):
             deflection.publish(sample(number, 0.0))
             neighbour.wait(lambda n=number: commands[-1].number == n)
@@ -219,6 +274,7 @@ def test_a_reference_that_no_finger_reaches_is_refused(neighbour, tmp_path, nons
     assert 0.0 < commands[-1].value < 22e-6
 
 
+@pytest.mark.shows("half a controller, an unknown name, a value out of range")
 def test_a_controller_changes_as_a_whole_or_not_at_all(neighbour, tmp_path):
     """One parameter after the other, as tools that load parameter files send them."""
     second = {
@@ -251,8 +307,7 @@ def test_a_changed_parameter_is_used_before_the_first_sample(neighbour, tmp_path
         reference = neighbour.publisher("reference", SETPOINT)
         deflection = neighbour.publisher("deflection")
         assert neighbour.set("feedback", command_high=5e-6).successful
-        reference.publish(sample(0, 10e-6))
-        assert reference.wait_for_all_acked()
+        neighbour.tell("feedback", reference, sample(0, 10e-6))
         neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
     assert commands[0].value == 5e-6
 
@@ -264,6 +319,7 @@ def test_an_uncertified_controller_is_said_loudly(neighbour, tmp_path):
     assert "not certified" in log(tmp_path, "feedback")
 
 
+@pytest.mark.shows("a loop that falls behind its sample time")
 def test_a_loop_at_another_rate_than_the_controllers_is_not_driven(neighbour, tmp_path):
     parameters = {"mode": "free_running"}
     with node("feedback", tmp_path, "feedback_robust.yaml", **parameters):
@@ -300,7 +356,6 @@ def test_a_free_cantilever_latches_and_moves_with_the_wall_clock(neighbour, tmp_
         neighbour.wait(lambda: states[-1].voltage == 20.0 and states[-1].text == "")
     stamps = [d.header.stamp.sec + d.header.stamp.nanosec * 1e-9 for d in deflections]
     behind = [t - d.number * d.period for t, d in zip(stamps, deflections)]
-    # A stamp is taken a moment after the count of samples, on a busy machine a long moment.
     assert max(behind) - min(behind) < 0.3
     assert deflections[-1].number > len(deflections) + 50  # the halt is in the numbers
 

@@ -31,7 +31,7 @@ from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
-TIMEOUT = 20.0  # s, generous: the tests wait on conditions
+TIMEOUT = 60.0  # s, generous: the tests wait on conditions
 
 
 class Neighbour:
@@ -85,6 +85,12 @@ class Neighbour:
         self.node.destroy_timer(timer)
         return next(answer.result() for answer in answers if answer.done())
 
+    def tell(self, node, publisher, message):
+        """Publish a message that `node` has taken when this returns, as it serves events in their order."""
+        publisher.publish(message)
+        assert publisher.wait_for_all_acked()
+        self.get(node, "autostart")
+
     def set(self, node, **values):
         request = SetParametersAtomically.Request()
         request.parameters = [Parameter(n, value=v).to_parameter_msg() for n, v in values.items()]
@@ -137,8 +143,7 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
         commands = neighbour.listen(Sample, "command")
         reference = neighbour.publisher("reference", SETPOINT)
         deflection = neighbour.publisher("deflection")
-        reference.publish(sample(0, 10e-6))
-        assert reference.wait_for_all_acked()
+        neighbour.tell("feedback", reference, sample(0, 10e-6))
         # The answer got lost: asked again, nothing is computed anew.
         neighbour.insist(deflection, sample(0, 0.0), lambda: len(commands) >= 4)
         deflection.publish(sample(1, 1e-6))
@@ -162,8 +167,7 @@ def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp
         commands = neighbour.listen(Sample, "command")
         reference = neighbour.publisher("reference", SETPOINT)
         deflection = neighbour.publisher("deflection")
-        reference.publish(sample(0, 10e-6))
-        assert reference.wait_for_all_acked()
+        neighbour.tell("feedback", reference, sample(0, 10e-6))
         neighbour.insist(deflection, sample(0, 9e-6), lambda: commands)
         for number in range(1, 50):
             deflection.publish(sample(number, 9e-6))
@@ -178,6 +182,7 @@ def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp
     assert abs(commands[-1].value - before) <= 2 * step + 1e-12
 
 
+@pytest.mark.shows("no answer to a sample for `reply_timeout`")
 def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tmp_path):
     with node("cantilever", tmp_path, reply_timeout=0.5):
         deflections = neighbour.listen(Sample, "deflection")
@@ -201,6 +206,7 @@ def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tm
     assert re.match(r"no answer to sample 2 .*'/command' or '/voltage'", state.text)
 
 
+@pytest.mark.shows("SIGKILL of a node")
 def test_cantilever_names_the_missing_node(neighbour, tmp_path):
     with node("cantilever", tmp_path):
         states = neighbour.listen(FingerState, "state", LATCHED)
@@ -209,6 +215,7 @@ def test_cantilever_names_the_missing_node(neighbour, tmp_path):
         neighbour.wait(lambda: "node 'feedforward' is gone" in states[-1].text)
 
 
+@pytest.mark.shows("a value that is not finite or that no finger reaches")
 def test_cantilever_refuses_a_voltage_that_is_no_number(neighbour, tmp_path):
     with node("cantilever", tmp_path):
         states = neighbour.listen(FingerState, "state", LATCHED)
@@ -237,6 +244,9 @@ def test_feedforward_answers_with_the_law(neighbour, tmp_path):
     assert [voltages[0].value, *(v.value for v in got)] == [law.step(value) for value in commands]
 
 
+@pytest.mark.shows(
+    "it stays away for `hold_time`", "deactivation, shutdown, SIGINT, SIGTERM, SIGHUP, SIGQUIT"
+)
 @pytest.mark.parametrize("end", ["silence", "deactivation", "SIGTERM", "SIGINT"])
 def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     slew = 1e3  # V/s, so 20 V take 20 ms
@@ -266,6 +276,7 @@ def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     assert after_the_top == sorted(after_the_top, reverse=True)
 
 
+@pytest.mark.shows("an input is late", "it stays away for `hold_time`")
 def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
     parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
     with node("cantilever", tmp_path, **parameters):

@@ -87,6 +87,7 @@ def test_whatever_happens_a_latched_fault_goes_to_rest_and_stays(events, voltage
         assert guard.phase == NORMAL and guard.cause == "" and guard.times == 0
 
 
+@pytest.mark.shows("an input is late", "it stays away for `hold_time`")
 def test_a_late_input_holds_and_a_missing_one_ramps():
     guard = Guard(hold_time=0.1)
     guard.look(1e6, 0.01, "command")  # nothing is missed before the first one

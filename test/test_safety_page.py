@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The safety page says what the code does: its figures are the defaults of the parameters."""
+"""The safety page says what the code does: defaults are the parameters', every row of faults has its test."""
 
 from pathlib import Path
 
 import pytest
+import test_gripper
+import test_node_faults
+import test_nodes
+import test_safety
 
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
 from piezo_sim.nodes.parameters import CantileverNodeParameters
@@ -41,3 +45,15 @@ def test_figures_of_the_page_are_the_defaults(parameter, value):
 def test_symmetric_default():
     assert FEEDFORWARD.voltage_high == -FEEDFORWARD.voltage_low == 40.0
     assert (CANTILEVER.ramp, CANTILEVER.hold_time) == (FEEDFORWARD.ramp, FEEDFORWARD.hold_time)
+
+
+def test_every_row_of_faults_is_shown_by_a_test_and_every_such_test_has_a_row():
+    table = PAGE.split("| what is seen |")[1].split("\n\n")[0].splitlines()[2:]
+    rows = {line.split("|")[1].strip() for line in table}
+    marks = [
+        mark
+        for module in (test_gripper, test_node_faults, test_nodes, test_safety)
+        for test in vars(module).values()
+        for mark in getattr(test, "pytestmark", [])
+    ]
+    assert rows == {row for mark in marks if mark.name == "shows" for row in mark.args}

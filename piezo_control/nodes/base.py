@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -36,6 +37,7 @@ from piezo_control.parameters import (
     need_one_for,
     unknown,
 )
+from piezo_control.safety import PHASES, Guard
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 
@@ -52,6 +54,24 @@ ROS_TYPES = {
 def system_time() -> Time:
     """Return the time of the clock on the wall as a stamp, whatever simulated time says."""
     return Clock().now().to_msg()
+
+
+def wall_time(instant: float) -> Time:
+    """Return an instant of `time.monotonic` (s) as a stamp of the clock on the wall; NaN as 0."""
+    if math.isnan(instant):
+        return Time()
+    seconds, nanoseconds = divmod(round((time.time() - time.monotonic() + instant) * 1e9), 10**9)
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def told(guard: Guard) -> dict[str, Any]:
+    """Return what a guard does, since when and how often, as figures for `/diagnostics`."""
+    since = wall_time(guard.since).sec
+    return {
+        "phase": PHASES[guard.phase],
+        "since": time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(since)) if since else "",
+        "faults": guard.times,
+    }
 
 
 class FingerNode(LifecycleNode):

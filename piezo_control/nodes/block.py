@@ -5,9 +5,10 @@ In lock-step, that makes the loop deterministic whatever the transport does (:mo
 a stray sample means that somebody else answered samples of this topic, which no order of computation can
 mend. Running free, only the newest sample counts, and one that is too old is not acted upon.
 
-What cannot be right latches a fault (:mod:`piezo_control.safety`): a second publisher of the input, samples
-at another sample time than this block's, samples of the other mode. The block then answers no more, and
-its neighbours run into their time limits, until `~/reset` or the next activation.
+What cannot be right latches a fault (:mod:`piezo_control.safety`): a second publisher of the input or one that
+cannot be heard, samples at another sample time than this block's, samples of the other mode. The block then
+answers no more until `~/reset` or the next activation. It tells the finger on `fault`, so that it goes to rest
+and its `state` says why.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
+from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.qos import LATCHED, NEWEST, SAMPLE
+from piezo_control.nodes.qos import FAULTS, LATCHED, NEWEST, SAMPLE
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.safety import Guard, is_physical
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 
 SIMULATED_TIME = 1e8  # s: a stamp below is no time of a clock on a wall
 
@@ -51,17 +53,19 @@ class BlockNode(FingerNode):
     OUTPUT: str
     LARGEST: float
     """Size of the input beyond which it is a mistake."""
+    MOVES_VOLTAGE: bool
 
     def __init__(self) -> None:
         super().__init__()
         self.answers = self.create_publisher(Sample, self.OUTPUT, SAMPLE)
+        self.faults = self.create_publisher(Fault, "fault", FAULTS)
         self.last = Sample()
         self.sequence = Sequence()
         self.guard = Guard(hold_time=1.0)
         self.finger: FingerState | None = None
         self.create_subscription(FingerState, "state", self._on_state, LATCHED)
         self._input = SoleInput(
-            self, self.INPUT, self._on_sample, self._quality(), self._look_for_doubles
+            self, self.INPUT, self._on_sample, self._quality(), self._look_at_input
         )
 
     def restart(self) -> None:
@@ -76,36 +80,48 @@ class BlockNode(FingerNode):
         """Latch a fault."""
         if not self.guard.is_latched:
             self.get_logger().error(f"{cause}; no more answers until '~/reset' or a new activation")
-        self.guard.trip(cause, time.monotonic())
+        self.guard.trip(cause, time.monotonic(), at_rest=not self.MOVES_VOLTAGE)
+        self._tell()
+
+    def _tell(self) -> None:
+        """Say on `fault` and `/diagnostics` what is latched."""
+        fault = Fault(node=self.NAME, times=self.guard.times)
+        if self.guard.is_latched:
+            fault.text = self.guard.cause
+        fault.header.stamp = base.wall_time(self.guard.since)
+        self.faults.publish(fault)
         self.publish_diagnostics()
 
     def start(self) -> None:
         if self._input.qos is not self._quality():  # the mode was changed
             self._input.close()
             self._input = SoleInput(
-                self, self.INPUT, self._on_sample, self._quality(), self._look_for_doubles
+                self, self.INPUT, self._on_sample, self._quality(), self._look_at_input
             )
         self.sequence = Sequence(gaps=self.parameters.mode == "free_running")
-        self.guard.reset()
-        if doubles := self._input.doubles():
-            self.trip(doubles)
+        self._rearm()
 
     def reset(self) -> None:
-        self.guard.reset()
-        self._look_for_doubles()
+        self._rearm()
         if self.guard.is_latched:
             raise ValueError(self.guard.cause)
 
+    def _rearm(self) -> None:
+        self.guard.reset()
+        if wrong := self._input.wrong():
+            self.trip(wrong)
+        else:
+            self._tell()
+
     def report(self) -> tuple[str, dict[str, Any]]:
-        figures = {"sample": self.sequence.next - 1, "faults": self.guard.times}
-        return self.guard.cause, figures
+        return self.guard.cause, {"sample": self.sequence.next - 1, **base.told(self.guard)}
 
     def _quality(self) -> QoSProfile:
         return SAMPLE if self.parameters.mode == "lockstep" else NEWEST
 
-    def _look_for_doubles(self) -> None:
-        if self.active and (doubles := self._input.doubles()):
-            self.trip(doubles)
+    def _look_at_input(self) -> None:
+        if self.active and (wrong := self._input.wrong()):
+            self.trip(wrong)
 
     def _on_state(self, state: FingerState) -> None:
         self.finger = state

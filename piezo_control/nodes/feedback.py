@@ -38,6 +38,7 @@ class FeedbackNode(BlockNode):
     INPUT = "deflection"
     OUTPUT = "command"
     LARGEST = LARGEST_DEFLECTION
+    MOVES_VOLTAGE = False
 
     def __init__(self) -> None:
         super().__init__()

@@ -50,6 +50,7 @@ class FeedforwardNode(BlockNode):
     INPUT = "command"
     OUTPUT = "voltage"
     LARGEST = LARGEST_DEFLECTION
+    MOVES_VOLTAGE = True
 
     def __init__(self) -> None:
         super().__init__()
@@ -226,7 +227,7 @@ class FeedforwardNode(BlockNode):
             self.get_logger().error(
                 f"{self.guard.cause}: voltage goes to rest and stays there until '~/reset'"
             )
-            self.publish_diagnostics()
+            self._tell()
         if self.guard.phase == RAMPING:
             self._ramp()
         elif self.guard.phase == FAULT and self.parameters.mode == "lockstep":

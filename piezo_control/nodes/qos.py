@@ -15,6 +15,13 @@ SETPOINT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 # What others draw, record or control by: as ros2_control's own broadcasters have it.
 STREAM = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 
+# Faults of the blocks of a loop, all on one topic: the newest of each is kept for those who join later.
+FAULTS = QoSProfile(
+    depth=10,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
 # Profiles and states: the newest is kept for those who join later.
 LATCHED = QoSProfile(
     depth=1,

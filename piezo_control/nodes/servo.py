@@ -14,6 +14,7 @@ sensor, a deflection that the model cannot explain, an oscillation, late or miss
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
@@ -119,7 +120,8 @@ class ServoNode(FingerNode):
         self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin)
         self.reference.restart(controller.sample_time)
         self.servo.refer(self.reference.signal)
-        self._told = self._since = time.monotonic()
+        self._told = time.monotonic()
+        self._since = math.nan
         self._rates = [(self._told, 0)]
         self._errors.clear()
         self._complained = False
@@ -241,6 +243,10 @@ class ServoNode(FingerNode):
         if phase == self.phase:
             return
         before, self.phase = self.phase, phase
+        if phase == FingerState.RUNNING:
+            self._since = math.nan
+        elif math.isnan(self._since):
+            self._since = time.monotonic()
         if phase in LATCHED_PHASES and before not in LATCHED_PHASES:
             self.get_logger().error(
                 f"{s.cause}; voltage goes to rest and stays there until '~/reset'"
@@ -261,6 +267,8 @@ class ServoNode(FingerNode):
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
             state.text = s.cause or s.complaint
+            state.since = base.wall_time(self._since)
+            state.times = s.faults
             if self._last:
                 state.deflection = float(self._last.deflection[-1])
             worst = max((error for _, error in self._errors), default=np.inf)

@@ -2,13 +2,15 @@
 """The simulated piezocantilever with its amplifier and sensor: the block H_s·D(s) + b of the paper.
 
 in:  voltage (Sample, V), temperature (sensor_msgs/Temperature, °C),
-     tip_force (Sample, N: one value), tip_force_profile (Profile, N), tip_force_waveform (Waveform, N)
+     tip_force (Sample, N: one value), tip_force_profile (Profile, N), tip_force_waveform (Waveform, N),
+     fault (Fault: of the blocks of its loop)
 out: deflection (Sample, m), clock (rosgraph_msgs/Clock), state (FingerState)
 
 In lock-step it is the master of time: it publishes deflection k, moves on when voltage k is there, and
 asks again for what is late by publishing the same sample and the same clock once more. An answer that
 never comes ends the run with 0 V and an error that says which topic fell silent. Running free it moves
-on with the wall clock, holds the newest voltage and ramps to 0 V when that gets old.
+on with the wall clock, holds the newest voltage and ramps to 0 V when that gets old. A fault that a block
+of the loop has latched is one of the finger: it goes to rest, and its `state` says which and why.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.block import seconds, wrong_time
 from piezo_control.nodes.profile_input import ProfileInput
-from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.safety import (
     FAULT,
@@ -42,7 +44,7 @@ from piezo_control.safety import (
     limits,
 )
 from piezo_control.sequence import grid_index
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 from piezo_sim.nodes.parameters import CantileverNodeParameters
 from piezo_sim.plant.cantilever import Cantilever
 
@@ -61,8 +63,10 @@ class CantileverNode(FingerNode):
         self.deflections = self.create_publisher(Sample, "deflection", SAMPLE)
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
-        self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_for_doubles)
+        self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_around)
         self.create_subscription(Temperature, "temperature", self._on_temperature, SAMPLE)
+        self.create_subscription(Fault, "fault", self._on_fault, FAULTS)
+        self.faults: dict[str, str] = {}
         self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
         self.create_steady_timer(STATE_PERIOD, self._publish_state)
         self.watchdog = self.create_steady_timer(RETRY_PERIOD, self._watch, autostart=False)
@@ -96,8 +100,8 @@ class CantileverNode(FingerNode):
         self._reset()
         self._enter(FingerState.WAITING)
         self.heard = self.begun = monotonic()
-        if doubles := self.voltages.doubles():
-            self._fault(doubles)
+        if wrong := self._wrong():
+            self._fault(wrong)
         if self.parameters.mode == "lockstep":
             if self.guard.is_latched:
                 return
@@ -115,6 +119,7 @@ class CantileverNode(FingerNode):
             self._enter(FingerState.IDLE)
         else:
             self._end(FingerState.IDLE)
+        self.guard.reset()
 
     def apply(self) -> None:
         self.guard.hold_time = self.parameters.hold_time
@@ -128,7 +133,7 @@ class CantileverNode(FingerNode):
         else:
             self.guard.reset()
             self.pending_voltage = None
-            self._look_for_doubles()
+            self._look_around()
         if self.guard.is_latched:
             raise ValueError(self.text)
 
@@ -137,6 +142,7 @@ class CantileverNode(FingerNode):
             "samples": self.number,
             "asked again": self.asked_again,
             "clipped": self._clipped(),
+            **base.told(self.guard),
         }
         is_wrong = self.phase in (FingerState.FAULT, FingerState.HOLDING, FingerState.RAMPING)
         return self.text if is_wrong else "", figures
@@ -147,9 +153,22 @@ class CantileverNode(FingerNode):
     def _limits(self) -> Limits:
         return limits(self.parameters.amplifier, self.parameters.ramp)
 
-    def _look_for_doubles(self) -> None:
-        if self.active and (doubles := self.voltages.doubles()):
-            self._fault(doubles)
+    def _on_fault(self, fault: Fault) -> None:
+        """Take note of what a block of the loop has latched."""
+        self.faults.pop(fault.node, None)
+        if fault.text:
+            self.faults[fault.node] = fault.text
+            self._look_around()
+
+    def _look_around(self) -> None:
+        """Latch what is wrong with the loop around this node."""
+        if self.active and self.phase != FingerState.FINISHED and (wrong := self._wrong()):
+            self._fault(wrong)
+
+    def _wrong(self) -> str:
+        """Say what is wrong with the loop around this node; empty: nothing."""
+        blocks = "; ".join(f"{node}: {text}" for node, text in self.faults.items())
+        return self.voltages.wrong() or blocks
 
     # --- lock-step ----------------------------------------------------------------------------------
 
@@ -305,7 +324,7 @@ class CantileverNode(FingerNode):
             self.plant.advance(demand, self.temperature, self.tip_force[number])
         self.number = due
         sample = Sample(number=self.number, value=self.plant.measure(), period=p.sample_time)
-        sample.header.stamp = base.system_time()
+        sample.header.stamp = base.wall_time(now)
         self.sample = sample
         self.deflections.publish(sample)
         if now - self.clocked >= p.clock_period:
@@ -330,7 +349,10 @@ class CantileverNode(FingerNode):
     # --- ends ---------------------------------------------------------------------------------------
 
     def _fault(self, text: str) -> None:
+        was_latched = self.guard.is_latched
         self.guard.trip(text, monotonic())
+        if was_latched:
+            return
         if self.parameters.mode == "free_running":
             self.get_logger().error(f"{text}; voltage goes to rest and stays there until '~/reset'")
             return
@@ -343,8 +365,10 @@ class CantileverNode(FingerNode):
         """Ramp the finger to rest and say how the run ended."""
         self.watchdog.cancel()
         self.tick.cancel()
-        ending = Guard(self.parameters.hold_time)
-        ending.trip(text, monotonic())
+        ending = self.guard
+        if not ending.is_latched:
+            ending = Guard(self.parameters.hold_time)
+            ending.trip(text, monotonic())
         h, within, voltage = self.parameters.sample_time, self._limits(), self.plant.voltage
         while ending.phase == RAMPING:
             voltage = ending.voltage(within, voltage, h)
@@ -360,6 +384,8 @@ class CantileverNode(FingerNode):
         state = FingerState(phase=self.phase, samples=self.number, text=self.text)
         if self.without_temperature and not self.text:
             state.text = "'voltage' is by models whose temperature is missing or frozen"
+        state.since = base.wall_time(self.guard.since)
+        state.times = self.guard.times
         state.header.stamp = self.sample.header.stamp
         state.deflection = self.sample.value
         state.voltage = self.plant.voltage

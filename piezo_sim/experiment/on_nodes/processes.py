@@ -51,23 +51,30 @@ class NodeProcesses:
         self.running: dict[str, subprocess.Popen] = {}
 
     def __enter__(self) -> NodeProcesses:
-        executables = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
         self._log_folder.mkdir(parents=True, exist_ok=True)
         try:
-            for name, arguments in self._commands.items():
-                with self._log(name).open("wb") as log:
-                    self.running[name] = subprocess.Popen(
-                        [str(executables / name), *arguments],
-                        stdin=subprocess.DEVNULL,
-                        stdout=log,
-                        stderr=subprocess.STDOUT,
-                        start_new_session=True,
-                        preexec_fn=end_with_parent,
-                    )
+            for name in self._commands:
+                self.start(name)
         except OSError:
             self.stop()
             raise
         return self
+
+    def start(self, name: str) -> None:
+        """Start the process `name`; where it was started before, its log goes on."""
+        with self._log(name).open("ab" if name in self.running else "wb") as log:
+            self.running[name] = subprocess.Popen(
+                [*self.program(name), *self._commands[name]],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                preexec_fn=end_with_parent,
+            )
+
+    def program(self, name: str) -> list[str]:
+        """Return what is run as `name`: the package's executable."""
+        return [str(Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE / name)]
 
     def __exit__(self, *_: object) -> None:
         self.stop()

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cantilever node with a witness at the plant, who writes 'VIOLATED' into its log for what no finger may see."""
+
+import math
+import sys
+
+from piezo_control.nodes import base
+from piezo_control.safety import VoltageParameters
+from piezo_sim.nodes.cantilever import CantileverNode
+from piezo_sim.plant.cantilever import Cantilever
+
+STANDS = VoltageParameters()
+FARTHEST = 66e-6  # m: where a step over the whole reach of 44 µm overshoots to, undamped, from its end at 22 µm
+
+
+class Witness(Cantilever):
+    """A cantilever that looks at every sample: limits, slew in time, finite numbers.
+
+    The voltage comes from a feedforward, limited to `STANDS.slew_limit`; running free, messages may come in
+    a burst, and it is the amplifier that keeps the slew in time.
+    """
+
+    def __init__(self, parameters):
+        super().__init__(parameters)
+        slew = STANDS.slew_limit
+        if parameters.mode == "free_running":
+            slew = parameters.amplifier.slew_limit
+        self.largest_step = slew * parameters.sample_time * (1 + 1e-9)
+
+    def advance(self, voltage, temperature_degc, tip_force=0.0):
+        before = self.voltage
+        super().advance(voltage, temperature_degc, tip_force)
+        now = self.voltage
+        if not STANDS.voltage_low <= now <= STANDS.voltage_high:
+            self.say(f"{now} V")
+        if not abs(now - before) <= self.largest_step:
+            self.say(f"{before} V to {now} V in one sample, allowed are {self.largest_step} V")
+        if not (math.isfinite(self.deflection) and abs(self.deflection) <= FARTHEST):
+            self.say(f"deflection {self.deflection} m")
+
+    def say(self, text):
+        print(f"VIOLATED at sample {self.samples}: {text}", file=sys.stderr, flush=True)
+
+
+class WitnessedNode(CantileverNode):
+    def _reset(self):
+        super()._reset()
+        self.plant = Witness(self.parameters)
+
+
+if __name__ == "__main__":
+    sys.exit(base.run(WitnessedNode))
