@@ -102,6 +102,7 @@ setup(
             "identify = piezo_control.start:identify",
             "synthesize = piezo_control.start:synthesize",
             "servo = piezo_control.start:servo",
+            "export = piezo_control.start:export",
             "commission = piezo_control.start:commission",
             "udp_finger = piezo_sim.start:udp_finger",
             "gripper = piezo_control.start:gripper",

@@ -285,7 +285,7 @@ class Feedback:
         A controller without states (``none``) has nothing to choose: its command is what its equation
         says. A command outside the limits is limited first.
 
-        Raises ValueError when the controller cannot hold a command (a zero at z = 1).
+        Raises ParameterError when the controller cannot hold a command (a zero at z = 1).
         """
         p = self.parameters
         limited = min(max(command, p.command_low), p.command_high)
@@ -306,7 +306,7 @@ def hand_over(parameters: FeedbackParameters) -> np.ndarray:
 
     Raises
     ------
-    ValueError
+    ParameterError
         If the controller cannot hold a constant command (a zero at z = 1).
     """
     p = parameters
@@ -323,6 +323,6 @@ def hand_over(parameters: FeedbackParameters) -> np.ndarray:
     try:
         return np.linalg.solve(system, right)[:n]
     except np.linalg.LinAlgError:
-        raise ValueError(
+        raise ParameterError(
             f"controller '{p.name}' cannot hold a constant command: it has a zero at z = 1"
         ) from None

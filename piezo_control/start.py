@@ -20,6 +20,7 @@ def executable(module: str) -> Callable[[], int]:
 
 
 commission = executable("piezo_control.servo.commission")
+export = executable("piezo_control.export.cli")
 feedback = executable("piezo_control.nodes.feedback")
 fingerctl = executable("piezo_control.nodes.fingerctl")
 feedforward = executable("piezo_control.nodes.feedforward")

@@ -26,7 +26,7 @@ LEVELS = [
     {"hysteresis", "dynamics", "creep", "thermal", "feedback", "gripper", "recording"},
     {"shaping", "feedforward", "sensorless", "thermometer", "design"},
     {"identification", "servo", "touch"},
-    {"nodes"},
+    {"nodes", "export"},
     {"plant", "temperature"},
     {"engine", "sim_nodes", "driver", "udp_finger"},
     {"experiment"},
@@ -92,6 +92,7 @@ def test_only_nodes_and_what_starts_them_need_ros(path):
         ["piezo_sim.experiment.cli", "step", "--engine", "--out", "{out}"],
         ["piezo_control.identification.cli", "--help"],
         ["piezo_control.design.cli", "--help"],
+        ["piezo_control.export.cli", "--out", "{out}"],
     ],
     ids=lambda command: command[0],
 )

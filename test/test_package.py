@@ -31,6 +31,7 @@ EXECUTABLES = {
     "gripper",
     "servo",
     "commission",
+    "export",
     "udp_finger",
 }
 

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the nodes of the loop, the laws' own and those of running as a node; needs no ROS."""
+"""Parameters of the nodes of the loop and the files they come in; needs no ROS."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import group, parameter
+from piezo_control.parameters import ParameterError, build, group, load, parameter
 from piezo_control.safety import SafetyParameters
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.servo.parameters import ServoParameters
@@ -130,3 +130,26 @@ class RecorderParameters:
 
     bag: str = parameter("", "folder to write, new; empty: 'finger_' and the time in this folder")
     topics: tuple[str, ...] = parameter(RECORDED, "topics to record, relative or absolute")
+
+
+def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
+    """Return inverse and limits of a parameter file, the limits scaled by the share that is to be used."""
+    path = parameters.feedforward_file
+    whole = build(FeedforwardParameters, load(path, "feedforward") if path else {}, path)
+    share = parameters.voltage_share
+    return replace(
+        whole, voltage_low=share * whole.voltage_low, voltage_high=share * whole.voltage_high
+    )
+
+
+def check_delay(controller: FeedbackParameters, p: ServoNodeParameters) -> None:
+    """Raise ParameterError unless the controller was designed for the delay of the servo's loop.
+
+    An open loop was designed for any.
+    """
+    delay = p.delay_samples + (p.write == "next_edge")
+    if controller.controller != "none" and controller.delay_samples != delay:
+        raise ParameterError(
+            f"controller '{p.controller_file}' was designed for a delay of {controller.delay_samples} samples, "
+            f"this loop has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"
+        )

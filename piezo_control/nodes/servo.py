@@ -16,19 +16,17 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from piezo_control.feedback import FeedbackParameters, successor
-from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.parameters import ServoNodeParameters
+from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError
 from piezo_control.safety import FAULT, HOLDING, LARGEST_DEFLECTION, NORMAL, RAMPING
 from piezo_control.servo.clock import lateness_quantile
 from piezo_control.servo.driver import DriverError, open_driver
@@ -43,16 +41,6 @@ PHASES = {
     FAULT: FingerState.FAULT,
 }
 LATCHED_PHASES = (FingerState.RAMPING, FingerState.FAULT)
-
-
-def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
-    """Return inverse and limits of a parameter file, the limits scaled by the share that is to be used."""
-    path = parameters.feedforward_file
-    whole = build(FeedforwardParameters, load(path, "feedforward") if path else {}, path)
-    share = parameters.voltage_share
-    return replace(
-        whole, voltage_low=share * whole.voltage_low, voltage_high=share * whole.voltage_high
-    )
 
 
 class ServoNode(FingerNode):
@@ -84,7 +72,7 @@ class ServoNode(FingerNode):
     def check(self, parameters: ServoNodeParameters) -> None:
         if parameters.controller_file != self.parameters.controller_file or not self.active:
             controller = self._controller(parameters.controller_file)
-            self._check_delay(controller, parameters)
+            check_delay(controller, parameters)
             if self.servo and controller.sample_time != self.servo.sample_time:
                 raise ParameterError(
                     f"'controller_file' is '{parameters.controller_file}', made for "
@@ -95,18 +83,10 @@ class ServoNode(FingerNode):
     def _controller(self, name: str) -> FeedbackParameters:
         return successor(name, self.servo.feedback if self.servo else FeedbackParameters())
 
-    def _check_delay(self, controller: FeedbackParameters, p: ServoNodeParameters) -> None:
-        delay = p.delay_samples + (p.write == "next_edge")
-        if controller.controller != "none" and controller.delay_samples != delay:
-            raise ParameterError(
-                f"controller '{p.controller_file}' was designed for a delay of {controller.delay_samples} "
-                f"samples, this loop has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"
-            )
-
     def start(self) -> None:
         p = self.parameters
         controller = self._controller(p.controller_file)
-        self._check_delay(controller, p)
+        check_delay(controller, p)
         if controller.controller != "none" and not controller.certified:
             self.get_logger().warning(
                 f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "

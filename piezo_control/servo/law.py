@@ -195,7 +195,7 @@ def empty_controller() -> Controller:
 def put_controller(room: Controller, parameters: FeedbackParameters) -> None:
     """Put a controller into the `room` of one that is not in use.
 
-    Raises ParameterError for more than `LARGEST_ORDER` states, ValueError as :func:`hand_over`.
+    Raises ParameterError for more than `LARGEST_ORDER` states, and as :func:`hand_over`.
     """
     if parameters.order > LARGEST_ORDER:
         raise ParameterError(
