@@ -9,8 +9,10 @@ its sample number times the sample time: running free that is the wall clock, in
 one, which passes at whatever speed the machine manages. So the speed holds in both, to the sample, and no
 message has to be in time. A trajectory of openings is the same with more than one line.
 
-The force is the larger of the two pushes that bend the tips open, -tip_force. It ends closing motions;
-opening relieves it.
+The force is the larger of the two pushes of the object, as the fingers' loops tell them. These loops stop at
+`max_force` and hold it by themselves, within milliseconds; what is decided here is when that is so and both
+fingers rest. The references then stay `HOLD_BEYOND` ahead of the tips, so that it is the force that is held,
+not the place, and a finger whose object is gone goes no further than that.
 """
 
 from __future__ import annotations
@@ -18,13 +20,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import NamedTuple
 
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
+from piezo_control.touch import TouchParameters
 
 SMALLEST = 1e-9
-"""Slowest speed (m/s) and least force (N) of a goal: less is a mistake, no motion."""
+"""Slowest speed (m/s) of a goal: less is a mistake, no motion."""
+
+HOLD_BEYOND = 1e-6
+"""How far (m) a reference stays ahead of a tip that holds a force."""
+
+AT_LIMIT = 0.9
+"""Share of the force limit from which on a finger has stalled."""
+
+REST_TIME = 0.05
+"""A finger rests when it has stayed in place for so long (s)."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +63,11 @@ class GripperParameters:
     force_limit: float = parameter(
         5e-3, "highest force a goal may ask for, and the limit where it names none", unit="N",
         low=1e-6, high=10.0,
+    )  # fmt: skip
+    touch_force: float = parameter(
+        TouchParameters.touch_force,
+        "least force a goal may ask for: what fingers feel below may be drift of their models", unit="N",
+        low=1e-9, high=1.0,
     )  # fmt: skip
     tolerance: float = parameter(
         2e-7, "the opening is reached when it is so near", unit="m", low=1e-9, high=1e-4
@@ -119,7 +137,7 @@ def check_goal(
     narrowest, widest = reach(p)
     for name, low, high, unit in (
         ("opening", narrowest, widest, "m"),
-        ("max_force", SMALLEST, p.force_limit, "N"),
+        ("max_force", p.touch_force, p.force_limit, "N"),
         ("speed", SMALLEST, p.speed_limit, "m/s"),
     ):
         value = getattr(goal, name)
@@ -168,9 +186,9 @@ def opening_of(parameters: GripperParameters, deflections: Sequence[float]) -> f
     return parameters.rest_opening - sum(deflections)
 
 
-def force_of(tip_forces: Sequence[float]) -> float:
-    """Return the larger push (N, >= 0) on tips with these tip forces (N, negative opens)."""
-    return max(0.0, *(-force for force in tip_forces))
+def force_of(pushes: Sequence[float]) -> float:
+    """Return the larger of the object's pushes (N, >= 0) on the tips; NaN when one is not known."""
+    return math.nan if any(map(math.isnan, pushes)) else max(0.0, *pushes)
 
 
 def hold(reference: float) -> Profile:
@@ -195,6 +213,7 @@ class Motion:
         openings = [waypoint.opening for waypoint in goal.waypoints] or [goal.opening]
         self._closing = max(map(self._reference, openings)) > min(references)
         self._arrivals = [math.inf] * len(references)
+        self._places = [(math.inf, math.nan)] * len(references)  # since when (s) a tip is where (m)
 
     def departed(self, finger: int) -> bool:
         """Tell whether `depart` was called for this finger."""
@@ -216,19 +235,35 @@ class Motion:
         """Return the reference (m) of either finger at an opening (m)."""
         return (self._parameters.rest_opening - opening) / 2.0
 
+    def rests(self, finger: int, time: float, deflection: float) -> bool:
+        """Take note of where a tip is (m) at its time (s); say whether it has been there for a while."""
+        since, place = self._places[finger]
+        if not abs(deflection - place) <= self._parameters.tolerance / 2.0:
+            since = time
+            self._places[finger] = time, deflection
+        return time - since >= REST_TIME
+
     def decide(
-        self, times: Sequence[float], deflections: Sequence[float], tip_forces: Sequence[float]
+        self, times: Sequence[float], deflections: Sequence[float], pushes: Sequence[float]
     ) -> Outcome | None:
-        """Return how the motion ended, or None while it goes on; every finger in its own time (s)."""
+        """Return how the motion ended, or None while it goes on.
+
+        Every finger in its own time (s); `pushes` (N) are NaN where a finger does not feel any.
+        """
         p = self._parameters
-        force = force_of(tip_forces)
+        force = force_of(pushes)
         error = opening_of(p, deflections) - self.goal.opening
         reached = abs(error) <= p.tolerance
-        if self._closing and force >= self.goal.max_force:
-            text = f"stopped by {force:g} N, limit {self.goal.max_force:g} N"
-            return Outcome(True, reached, True, text)
-        beyond = min(time - arrival for time, arrival in zip(times, self._arrivals))
-        if beyond >= 0.0 and reached:
+        rest = [self.rests(*finger) for finger in zip(count(), times, deflections)]
+        over = [time - arrival for time, arrival in zip(times, self._arrivals)]
+        stalled = [push >= AT_LIMIT * self.goal.max_force for push in pushes]
+        if self._closing and any(stalled) and all(rest):
+            # A finger that touches nothing goes on to the end of its line.
+            if all(at_limit or late >= 0.0 for at_limit, late in zip(stalled, over)):
+                text = f"stopped by {force:g} N, limit {self.goal.max_force:g} N"
+                return Outcome(True, reached, True, text)
+        beyond = min(over)
+        if beyond >= 0.0 and reached and all(rest):
             return Outcome(True, True, False, "reached")
         if beyond > p.settling_time:
             text = (

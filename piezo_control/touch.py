@@ -7,16 +7,17 @@ The models of hysteresis, heat and creep say where a tip that nobody pushes woul
     push = (lowpass(expected - deflection) - zero) / s_p.
 
 The models are off by a share of the way that the tip has gone, so while less than `touch_force` is felt, `zero`
-follows what is missing by up to `model_error` times the way, and slowly at rest. It follows at once where it
-says that something pulls, which no object does here (an adhesive one would be felt late). From `touch_force`
-on it stays. What the models are off by on the way in contact is the error of the push; an object so soft that
+follows what is missing by up to `model_error` times the way, and slowly at rest. It follows without a bound
+where it says that something pulls, which no object does here (an adhesive one would be felt late), but no faster
+than a vibration, of which it would take one half only. From `touch_force` on it stays. What the models are off by on the way in contact is the error of the push; an object so soft that
 a tip loses less than `model_error` of its way on it is not felt.
 
 The command integrates the slower of two wishes, to follow the reference and to push with `max_force`:
 
     command' = min(reference' + position_rate lowpass(reference - deflection),
-                   force_rate s_p (max_force - push)).
+                   force_rate s_p (max_force - push)),
 
+and opens no faster than force_rate s_p force_limit, so that a reference that jumps does not make it ring.
 There is one integrator, so one wish takes over from the other without a bump, and a finger comes no faster than
 it can stop: a tip that closes at force_rate s_p max_force meets a wall and the push goes to the limit
 exponentially. In contact with a stiffness k the static gain of the first is 1 / (1 + s_p k), that of the second
@@ -30,19 +31,10 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.parameters import parameter
-from piezo_control.sensorless import (
-    SensorlessCoefficients,
-    SensorlessParameters,
-    SensorlessState,
-    expected,
-    inverse_step,
-    sensorless_coefficients,
-    sensorless_rest,
-)
-from piezo_control.thermal import REFERENCE_DEGC
 
-PULL_TIME = 2e-3
+PULL_TIME = 0.02
 """Time constant (s) with which a pull, which no object gives, is taken for an error of the models."""
 
 PLAY = 1e-7
@@ -50,9 +42,20 @@ PLAY = 1e-7
 
 
 @dataclass(frozen=True)
-class TouchParameters(SensorlessParameters):
-    """Models of the finger, how far they are trusted, and how fast the finger may answer."""
+class TouchParameters:
+    """How far the models of the finger are trusted, and how fast the finger may answer."""
 
+    force_limit: float = parameter(
+        5e-3, "the finger pushes with no more than this, whatever is asked for", unit="N",
+        low=1e-6, high=10.0,
+    )  # fmt: skip
+    elastic_constant: float = parameter(
+        DynamicsParameters.elastic_constant,
+        "deflection per tip force",
+        unit="m/N",
+        low=1e-9,
+        high=10.0,
+    )
     position_rate: float = parameter(
         200.0, "rate of the loop that follows the reference", unit="1/s", low=1.0, high=1e4
     )
@@ -71,14 +74,11 @@ class TouchParameters(SensorlessParameters):
     zero_time: float = parameter(
         10.0, "time constant with which such drift is learned", unit="s", low=1e-2, high=1e6
     )
-    command_low: float = parameter(-22e-6, "lowest command", unit="m")
-    command_high: float = parameter(22e-6, "highest command", unit="m")
 
 
 class TouchCoefficients(NamedTuple):
-    """What :func:`touch_step` needs of the parameters; rates are shares per sample."""
+    """What the step functions need of the parameters; rates are shares per sample."""
 
-    models: SensorlessCoefficients
     elastic_constant: float  # m/N
     position_rate: float
     force_rate: float
@@ -87,15 +87,14 @@ class TouchCoefficients(NamedTuple):
     touch: float  # m
     zero_rate: float
     pull_rate: float
+    opening: float  # m, the most that it opens by
     command_low: float
     command_high: float
 
 
 class TouchState(NamedTuple):
-    """What :func:`touch_step` remembers, changed in place: lists (or float64 arrays)."""
+    """What the step functions remember, changed in place: lists (or float64 arrays)."""
 
-    models: SensorlessState
-    expected: list[float]  # m, of a tip that nobody pushes
     missing: list[float]  # expected - deflection (m), once and twice low-passed
     behind: list[float]  # reference - deflection (m), once and twice low-passed
     zero: list[float]  # m
@@ -104,37 +103,29 @@ class TouchState(NamedTuple):
     command: list[float]  # m, the last one
 
 
-def touch_coefficients(parameters: TouchParameters, sample_time: float) -> TouchCoefficients:
-    """Return the coefficients for a sample time (s); ParameterError as of `sensorless_coefficients`."""
+def touch_coefficients(
+    parameters: TouchParameters, sample_time: float, command_low: float, command_high: float
+) -> TouchCoefficients:
+    """Return the coefficients for a sample time (s) and limits of the command (m)."""
     p = parameters
-    s_p = p.dynamics.elastic_constant
     return TouchCoefficients(
-        sensorless_coefficients(p, sample_time),
-        s_p,
+        p.elastic_constant,
         p.position_rate * sample_time,
         p.force_rate * sample_time,
         sample_time / (p.filter_time + sample_time),
         p.model_error,
-        p.touch_force * s_p,
+        p.touch_force * p.elastic_constant,
         sample_time / p.zero_time,
         sample_time / (PULL_TIME + sample_time),
-        p.command_low,
-        p.command_high,
+        p.force_rate * sample_time * p.elastic_constant * p.force_limit,
+        command_low,
+        command_high,
     )
 
 
-def touch_rest(c: TouchCoefficients, temperature_degc: float) -> TouchState:
-    """Return the state of a homed finger at 0 V that touches nothing."""
-    return TouchState(
-        sensorless_rest(c.models, temperature_degc),
-        expected=[0.0],
-        missing=[0.0, 0.0],
-        behind=[0.0, 0.0],
-        zero=[0.0],
-        way=[0.0],
-        reference=[0.0],
-        command=[0.0],
-    )
+def touch_rest() -> TouchState:
+    """Return the state of a finger that touches nothing, at command 0."""
+    return TouchState([0.0, 0.0], [0.0, 0.0], [0.0], [0.0], [0.0], [0.0])
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
@@ -151,28 +142,16 @@ def push_of(c: TouchCoefficients, s: TouchState) -> float:
     return (s.missing[1] - s.zero[0]) / c.elastic_constant
 
 
-def feel(c: TouchCoefficients, s: TouchState, deflection: float) -> None:
-    """Take a reading (m) into the estimate of the push."""
-    low_pass(s.missing, c.filter_rate, s.expected[0] - deflection)
+def feel(c: TouchCoefficients, s: TouchState, expected: float, deflection: float) -> None:
+    """Take a reading (m) into the estimate of the push; `expected` (m) is that of a tip nobody pushes."""
+    low_pass(s.missing, c.filter_rate, expected - deflection)
     way = min(max(s.way[0], s.command[0] - PLAY), s.command[0] + PLAY)
     trust = c.model_error * abs(way - s.way[0])
     s.way[0] = way
     push = s.missing[1] - s.zero[0]
-    if push < 0.0:
-        s.zero[0] += c.pull_rate * push
-    elif push < c.touch:
-        s.zero[0] += c.zero_rate * push + min(push, trust)
-
-
-def follow(
-    c: TouchCoefficients, s: TouchState, command: float, temperature_degc: float, share: float
-) -> float:
-    """Take note of the command (m) that is given; return the voltage (V) that it comes to."""
-    warmth = s.models.body.degc[0] - REFERENCE_DEGC
-    voltage = inverse_step(c.models, s.models, command, temperature_degc, share)
-    s.expected[0] = expected(c.models, s.models, voltage, warmth)
-    s.command[0] = command
-    return voltage
+    if push < c.touch:
+        rate = c.pull_rate if push < 0.0 else c.zero_rate
+        s.zero[0] += rate * push + min(max(push, -trust), trust)
 
 
 def press(
@@ -183,48 +162,48 @@ def press(
     ahead = reference - s.reference[0] + c.position_rate * s.behind[1]
     s.reference[0] = reference
     push = c.force_rate * c.elastic_constant * (max_force - push_of(c, s))
-    command = s.command[0] + min(ahead, push)
-    return min(max(command, c.command_low), c.command_high)
+    change = max(min(ahead, push), -c.opening)
+    command = min(max(s.command[0] + change, c.command_low), c.command_high)
+    s.command[0] = command
+    return command
 
 
 class Touch:
-    """The law of one finger at a fixed `sample_time` (s), homed and touching nothing at `temperature_degc`.
+    """The law of one finger at a fixed `sample_time` (s), touching nothing at command 0.
 
-    >>> law = Touch(TouchParameters(), sample_time=1e-4, temperature_degc=22.0)
-    >>> law.step(1e-6, 0.0, max_force=1e-3, temperature_degc=22.0) < 1e-6
+    >>> law = Touch(TouchParameters(), sample_time=1e-4, command_low=-22e-6, command_high=22e-6)
+    >>> law.step(1e-6, deflection=0.0, expected=0.0, max_force=1e-3) < 1e-6
     True
     """
 
     def __init__(
-        self, parameters: TouchParameters, sample_time: float, temperature_degc: float
+        self,
+        parameters: TouchParameters,
+        sample_time: float,
+        command_low: float,
+        command_high: float,
     ) -> None:
-        self.coefficients = touch_coefficients(parameters, sample_time)
-        self.state = touch_rest(self.coefficients, temperature_degc)
+        self.parameters = parameters
+        self._coefficients = touch_coefficients(parameters, sample_time, command_low, command_high)
+        self.state = touch_rest()
 
-    def step(
-        self, reference: float, deflection: float, max_force: float, temperature_degc: float
-    ) -> float:
-        """Return the command (m) for one sample; a temperature (°C) that is NaN is one that is missing.
+    def step(self, reference: float, deflection: float, expected: float, max_force: float) -> float:
+        """Return the command (m) for one sample; `expected` (m) is the deflection of a tip nobody pushes.
 
-        Raises ValueError for any other input (m, m, N) that is not finite, or a force below 0; nothing
-        changes.
+        Of `max_force` (N) and the `force_limit` the smaller one counts. Raises ValueError for an input that is
+        not finite or a force below 0; nothing changes.
         """
-        if not (math.isfinite(reference) and math.isfinite(deflection)):
-            raise ValueError(
-                f"reference {reference!r} m and deflection {deflection!r} m must be finite"
-            )
-        if not 0.0 <= max_force < math.inf or math.isinf(temperature_degc):
-            raise ValueError(
-                f"max_force is {max_force!r} N, temperature is {temperature_degc!r} °C; must be finite, "
-                "the force 0 or more"
-            )
-        c, s = self.coefficients, self.state
-        feel(c, s, deflection)
-        command = press(c, s, reference, deflection, max_force)
-        follow(c, s, command, temperature_degc, 1.0)
-        return command
+        inputs = {"reference": reference, "deflection": deflection, "expected": expected}
+        for name, value in inputs.items():
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value!r} m, must be finite")
+        if not max_force >= 0.0:
+            raise ValueError(f"max_force is {max_force!r} N, must be 0 or more")
+        c, s = self._coefficients, self.state
+        feel(c, s, expected, deflection)
+        return press(c, s, reference, deflection, min(max_force, self.parameters.force_limit))
 
     @property
     def push(self) -> float:
         """Force (N) that pushes the tip back, as estimated."""
-        return push_of(self.coefficients, self.state)
+        return push_of(self._coefficients, self.state)

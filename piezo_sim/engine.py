@@ -41,17 +41,19 @@ from piezo_control.sensorless import (
     SensorlessCoefficients,
     SensorlessParameters,
     SensorlessState,
+    expected,
+    inverse_step,
     sensorless_coefficients,
     sensorless_rest,
     sensorless_step,
 )
 from piezo_control.sequence import grid_index
+from piezo_control.thermal import REFERENCE_DEGC
 from piezo_control.touch import (
     TouchCoefficients,
     TouchParameters,
     TouchState,
     feel,
-    follow,
     press,
     push_of,
     touch_coefficients,
@@ -116,10 +118,13 @@ class SensorlessFinger(NamedTuple):
 
 
 class TouchingFinger(NamedTuple):
-    """Coefficients and states of a finger that holds a force; the last two are of every sample."""
+    """Laws and plant of a finger that holds a force; the last two are of every sample."""
 
     law: TouchCoefficients
     law_state: TouchState
+    models: SensorlessCoefficients
+    models_state: SensorlessState
+    expected: np.ndarray  # m, of the next reading: one number
     plant: CantileverModel
     plant_state: CantileverState
     max_force: np.ndarray  # N
@@ -218,6 +223,7 @@ def run_sensorless(
 def run_touching(
     plant: CantileverParameters,
     touch: TouchParameters,
+    models: SensorlessParameters,
     temperatures: TemperatureParameters,
     reference: Profile,
     max_force: Profile,
@@ -226,22 +232,27 @@ def run_touching(
 ) -> tuple[Run, np.ndarray]:
     """Run a finger that pushes with `max_force` (N) at most; return it and the estimated push (N).
 
-    Other parameters as in :func:`run`. Raises ParameterError when the models have no inverse.
+    Other parameters as in :func:`run`, the limits of the command those of ``FeedbackParameters()``. Raises
+    ParameterError when the models have no inverse.
     """
     degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
-    law = touch_coefficients(touch, plant.sample_time)
+    command = FeedbackParameters()
+    inverse = sensorless_coefficients(models, plant.sample_time)
     sampled = cantilever.model(plant)
     finger = as_arrays(
         TouchingFinger(
-            law,
-            touch_rest(law, degc),
+            touch_coefficients(touch, plant.sample_time, command.command_low, command.command_high),
+            touch_rest(),
+            inverse,
+            sensorless_rest(inverse, degc),
+            np.zeros(1),
             sampled,
             cantilever.rest(sampled, plant.sensor.delay_samples, degc),
             max_force.at(np.arange(samples) * plant.sample_time),
             np.empty(samples),
         )
     )
-    clipped = finger.law_state.models.clipped
+    clipped = finger.models_state.clipped
     got = _run(
         run_touching_samples, finger, clipped, plant, temperatures, reference, samples, None, 1,
         compiled,
@@ -496,15 +507,19 @@ def run_touching_samples(
     """Run the samples of `inputs` with a force that is limited, the first one being number `first`."""
     law = finger.law
     law_state = finger.law_state
+    models = finger.models
+    models_state = finger.models_state
     plant = finger.plant
     state = finger.plant_state
     for n in range(len(inputs.reference)):
         look(plant, state, inputs.normal[n], inputs.uniform[n])
         deflection = state.readings[0]
-        feel(law, law_state, deflection)
+        feel(law, law_state, finger.expected[0], deflection)
         limit = finger.max_force[first + n]
         command = press(law, law_state, inputs.reference[n], deflection, limit)
-        voltage = follow(law, law_state, command, inputs.temperature[n], 1.0)
+        warmth = models_state.body.degc[0] - REFERENCE_DEGC
+        voltage = inverse_step(models, models_state, command, inputs.temperature[n], 1.0)
+        finger.expected[0] = expected(models, models_state, voltage, warmth)
         finger.push[first + n] = push_of(law, law_state)
         if (first + n) % every == 0:
             row = (first + n) // every

@@ -26,7 +26,8 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
-from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
+from piezo_control.touch import Touch, TouchParameters
+from piezo_gripper_msgs.msg import FingerState, Profile, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
@@ -160,6 +161,38 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
     log = (tmp_path / "feedback.log").read_text()
     assert "'deflection' brought sample 3, expected 2" in log
     assert "'deflection' sample 2 is nan, must be finite" in log
+
+
+def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neighbour, tmp_path):
+    """An object at 1 µm: the tip stays there, and the models say where it would be."""
+    limit, away = 2e-4, 1e-6
+    law = Touch(TouchParameters(), 1e-4, -22e-6, 22e-6)
+    rows = [(n, min(0.2e-6 * n, away), 0.2e-6 * n) for n in range(1, 10)]  # number, m, m
+    commands = [law.step(10e-6, *row[1:], limit) for row in [(0, 0.0, 0.0), *rows]]
+    with node("feedback", tmp_path, force_control=True):
+        answers = neighbour.listen(Sample, "command")
+        pushes = neighbour.listen(Sample, "push")
+        profile = neighbour.node.create_publisher(Profile, "reference_profile", LATCHED)
+        profile.publish(Profile(time=[0.0], value=[10e-6], max_force=limit))
+        neighbour.wait(lambda: profile.get_subscription_count() > 0)
+        assert profile.wait_for_all_acked()
+        expected = neighbour.publisher("expected", LATCHED)
+        deflection = neighbour.publisher("deflection")
+        said = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
+        neighbour.insist(deflection, sample(0, 0.0), lambda: answers)
+        for number, value, unhindered in rows:
+            deflection.publish(sample(number, value))
+            if number == 1:
+                neighbour.wait(
+                    lambda: any("waits for '/expected'" in s.status[0].message for s in said)
+                )
+            expected.publish(sample(number, unhindered))
+            neighbour.wait(lambda n=number: answers[-1].number == n)
+        neighbour.wait(lambda: pushes)
+    first = [a.number for a in answers].count(0)
+    assert [a.value for a in answers[first - 1 :]] == commands
+    assert all(a.by_controller for a in answers)
+    assert (pushes[0].number, pushes[0].value) == (0, 0.0)
 
 
 def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp_path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.profile import Profile
-from piezo_control.sensorless import SensorlessParameters
+from piezo_control.sensorless import Sensorless, SensorlessParameters
 from piezo_control.touch import Touch, TouchParameters
 from piezo_sim.engine import run_touching
 from piezo_sim.experiment.sensorless import identified
@@ -18,7 +19,7 @@ from piezo_sim.temperature import TemperatureParameters
 
 H = 1e-4  # s
 DEFAULTS = TouchParameters()
-ELASTIC = DEFAULTS.dynamics.elastic_constant
+ELASTIC = DEFAULTS.elastic_constant
 BEGIN = 0.1  # s
 AWAY = 5e-6  # m, from the tip at rest to the object
 STIFFNESSES = (300.0, 3000.0, 1e4, 1e5)  # N/m; a tip has 323
@@ -35,7 +36,7 @@ def spectral_radius(branch, stiffness, resonance=1.0, damping=1.0):
 
     State: x, v, the reading that is on its way, the low-pass, the command.
     """
-    a2, a1, _ = DEFAULTS.dynamics.denominator
+    a2, a1, _ = DynamicsParameters().denominator
     a2, a1 = a2 / resonance**2, a1 * damping / resonance
     motion = np.zeros((3, 3))
     motion[0, 1] = 1.0
@@ -76,16 +77,17 @@ def models():
     return {plant: identified(CantileverParameters(plant=plant)) for plant in MODEL_ERROR}
 
 
-def touch_of(plant: str, models: dict[str, SensorlessParameters]) -> TouchParameters:
-    return TouchParameters(**vars(models[plant]), model_error=MODEL_ERROR[plant])
+def touch_of(plant: str) -> TouchParameters:
+    return TouchParameters(model_error=MODEL_ERROR[plant])
 
 
-def close(plant, touch, contact, degc=22.0, speed=500e-6, target=12e-6, hold=0.5, limit=LIMIT):
+def close(plant, models, contact, degc=22.0, speed=500e-6, target=12e-6, hold=0.5, limit=LIMIT):
     """Close at `speed` (m/s) on an object; return the run, the estimate and the sample of the contact."""
     arrives = BEGIN + target / speed
     got, push = run_touching(
         CantileverParameters(plant=plant, contact=contact),
-        touch,
+        touch_of(plant),
+        models[plant],
         TemperatureParameters(base_degc=degc),
         Profile([BEGIN, arrives], [0.0, target], linear=True),
         Profile([0.0], [limit]),
@@ -101,11 +103,10 @@ TOLD = {"prandtl_ishlinskii": 0.02e-3, "truth": 0.13e-3}
 @pytest.mark.parametrize("degc", [22.0, 32.0])
 @pytest.mark.parametrize("plant", MODEL_ERROR)
 def test_closing_stops_at_the_force_and_holds_it(plant, degc, models):
-    touch = touch_of(plant, models)
     for stiffness in STIFFNESSES:
         for speed in (10e-6, 500e-6):
             got, push, touched = close(
-                plant, touch, ContactParameters(stiffness, 0.05, AWAY), degc, speed
+                plant, models, ContactParameters(stiffness, 0.05, AWAY), degc, speed
             )
             force = -got.total_force
             name = f"{plant}, {degc} degC, {stiffness:g} N/m, {speed * 1e6:g} um/s"
@@ -120,16 +121,16 @@ def test_closing_stops_at_the_force_and_holds_it(plant, degc, models):
 def test_a_wall_at_full_speed_is_met_no_faster_than_the_finger_can_stop(damping, models):
     """A tip of modal mass a2 / s_p that meets a spring k at v pushes with v sqrt(k m) at most."""
     plant, limit, stiffness = "prandtl_ishlinskii", 1e-3, 1e5
-    touch = touch_of(plant, models)
+    touch = touch_of(plant)
     got, push, touched = close(
-        plant, touch, ContactParameters(stiffness, damping, AWAY), target=20e-6, limit=limit
+        plant, models, ContactParameters(stiffness, damping, AWAY), target=20e-6, limit=limit
     )
     # Ringing from the start of the ramp may bring the tip at twice the command's speed.
     speed = np.max(np.diff(got.true_deflection[touched - 16 : touched + 1])) / H
     assert (
         speed < 2.1 * touch.force_rate * ELASTIC * limit
     )  # 310 of the 500 µm/s that are asked for
-    mass = DEFAULTS.dynamics.denominator[0] / ELASTIC
+    mass = DynamicsParameters().denominator[0] / ELASTIC
     force = -got.total_force
     assert force.max() < 1.2 * limit + speed * math.sqrt(stiffness * mass)
     assert push[-2000:].mean() == pytest.approx(limit, rel=0.02)
@@ -140,11 +141,12 @@ def test_a_wall_at_full_speed_is_met_no_faster_than_the_finger_can_stop(damping,
 @pytest.mark.parametrize("plant", MODEL_ERROR)
 def test_the_force_is_held_while_the_temperature_rises(plant, models):
     """10 degC in 5 s move a free tip by 1.5 µm and its stroke by 6 %; 1.5 µm are 0.48 mN on a wall."""
-    touch, limit = touch_of(plant, models), 1e-3
+    limit = 1e-3
     for stiffness in (300.0, 1e5):
         got, _ = run_touching(
             CantileverParameters(plant=plant, contact=ContactParameters(stiffness, 0.05, AWAY)),
-            touch,
+            touch_of(plant),
+            models[plant],
             TemperatureParameters(
                 profile="ramp", base_degc=22.0, amplitude_degc=10.0, start=1.0, duration=5.0
             ),
@@ -159,19 +161,18 @@ def test_the_force_is_held_while_the_temperature_rises(plant, models):
 
 
 def test_position_is_reached_and_kept_where_nothing_is_in_the_way(models):
-    got, push, _ = close(
-        "prandtl_ishlinskii", touch_of("prandtl_ishlinskii", models), ContactParameters()
-    )
+    got, push, _ = close("prandtl_ishlinskii", models, ContactParameters())
     assert np.mean(got.true_deflection[-2000:]) == pytest.approx(12e-6, abs=5e-9)
     assert np.max(np.abs(push)) < 0.5 * LIMIT
 
 
 def test_an_object_that_is_let_go_is_left_without_a_jump(models):
     """The reference goes back: one integrator, so the command moves no faster than its two wishes say."""
-    touch = touch_of("prandtl_ishlinskii", models)
+    touch = touch_of("prandtl_ishlinskii")
     got, _ = run_touching(
         CantileverParameters(contact=ContactParameters(3e3, 0.05, AWAY)),
         touch,
+        models["prandtl_ishlinskii"],
         TemperatureParameters(),
         Profile([BEGIN, 0.3, 0.6, 0.8], [0.0, 8e-6, 8e-6, 0.0], linear=True),
         Profile([0.0], [LIMIT]),
@@ -184,38 +185,48 @@ def test_an_object_that_is_let_go_is_left_without_a_jump(models):
     assert np.mean(got.true_deflection[-1000:]) == pytest.approx(0.0, abs=0.02e-6)
 
 
-def test_engine_and_class_give_the_same_commands():
+def law_of(parameters: TouchParameters = DEFAULTS) -> Touch:
+    return Touch(parameters, H, -22e-6, 22e-6)
+
+
+def test_engine_and_classes_give_the_same_commands():
     plant = CantileverParameters(contact=ContactParameters(1e3, 0.0, 1e-6))
     reference = Profile([0.0, 0.02], [0.0, 4e-6], linear=True)
     limit = Profile([0.0], [LIMIT])
+    models = SensorlessParameters()
     got, push = run_touching(
-        plant, DEFAULTS, TemperatureParameters(), reference, limit, 400, compiled=False
+        plant, DEFAULTS, models, TemperatureParameters(), reference, limit, 400, compiled=False
     )
-    law, finger = Touch(DEFAULTS, H, 22.0), Cantilever(plant)
+    law, feedforward, finger = law_of(), Sensorless(models, H, 22.0), Cantilever(plant)
     for n in range(400):
-        command = law.step(got.reference[n], finger.measure(), LIMIT, 22.0)
+        command = law.step(got.reference[n], finger.measure(), feedforward.predicted, LIMIT)
         assert (command, law.push) == (got.command[n], push[n])
-        finger.advance(got.voltage[n], 22.0)
+        voltage = feedforward.lead(command, 22.0)
+        assert voltage == got.voltage[n]
+        finger.advance(voltage, 22.0)
 
 
 @pytest.mark.parametrize(
     "inputs, message",
     [
-        ((math.nan, 0.0, 1e-3, 22.0), "reference nan"),
-        ((0.0, math.inf, 1e-3, 22.0), "deflection inf"),
-        ((0.0, 0.0, -1e-3, 22.0), "max_force is -0.001"),
-        ((0.0, 0.0, math.nan, 22.0), "max_force is nan"),
-        ((0.0, 0.0, 1e-3, math.inf), "temperature is inf"),
+        ((math.nan, 0.0, 0.0, 1e-3), "reference is nan"),
+        ((0.0, math.inf, 0.0, 1e-3), "deflection is inf"),
+        ((0.0, 0.0, math.nan, 1e-3), "expected is nan"),
+        ((0.0, 0.0, 0.0, -1e-3), "max_force is -0.001"),
+        ((0.0, 0.0, 0.0, math.nan), "max_force is nan"),
     ],
 )
 def test_what_is_no_number_is_refused_and_changes_nothing(inputs, message):
-    law, untouched = Touch(DEFAULTS, H, 22.0), Touch(DEFAULTS, H, 22.0)
+    law, untouched = law_of(), law_of()
     with pytest.raises(ValueError, match=message):
         law.step(*inputs)
     assert law.state == untouched.state
 
 
-def test_a_missing_temperature_leaves_the_body_as_it_is():
-    law = Touch(DEFAULTS, H, 22.0)
-    law.step(1e-6, 0.0, LIMIT, math.nan)
-    assert law.state.models.body.degc == [22.0]
+def test_the_finger_never_asks_for_more_than_its_own_limit():
+    """Nothing moves, and much is missing: the command goes on at the rate of the smaller force."""
+    low, high = law_of(TouchParameters(force_limit=1e-4)), law_of()
+    for _ in range(100):
+        commands = low.step(20e-6, 0.0, 0.0, math.inf), high.step(20e-6, 0.0, 0.0, 1e-4)
+        assert commands[0] == commands[1]
+    assert commands[0] == pytest.approx(100 * DEFAULTS.force_rate * H * ELASTIC * 1e-4)

@@ -2,31 +2,42 @@
 """The block K of the paper's loop: from the deflection and the reference to the command.
 
 in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m),
-     reference_waveform (Waveform, m)
-out: command (Sample, m)
+     reference_waveform (Waveform, m), expected (Sample, m) with `force_control`: the deflection of a tip that
+     nobody pushes
+out: command (Sample, m), push (Sample, N) with `force_control`: the force of an object, as estimated
 
 The newest of set-point, profile and waveform is followed. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
-loop runs, with the command where it was. Running free, nothing is answered before the deflections come at
-the sample time that the controller was made for, and a loop that falls behind ends in a fault.
+loop runs, with the command where it was. With `force_control`, in place of the controller, the loop follows the
+reference as long as the tip pushes with no more than the profile's `max_force` and its own `touch.force_limit`,
+and holds that force where something is in the way (:mod:`piezo_control.touch`). Running free, nothing is
+answered before the deflections come at the sample time that the controller was made for, and a loop that falls
+behind ends in a fault.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
 
 from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
 
 from piezo_control.feedback import Feedback, FeedbackParameters, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
+from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, flatten
-from piezo_control.safety import LARGEST_DEFLECTION, RateWatch
+from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
+from piezo_control.sequence import NEW
+from piezo_control.touch import Touch
 from piezo_gripper_msgs.msg import Sample
+
+PUSH_PERIOD = 1e-2  # s, between two of the push
 
 # What makes a controller; its limits of the command may change by themselves.
 DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high"}
@@ -42,6 +53,11 @@ class FeedbackNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__()
+        self.pushes = self.create_publisher(Sample, "push", SAMPLE)
+        self.expected = Sample()
+        self._expected_at = -math.inf
+        self._expectations: Subscription | None = None
+        self._waiting: Sample | None = None  # for what is expected of it
         self._file = ""
         self._loading = False
         self._take_file()
@@ -51,7 +67,8 @@ class FeedbackNode(BlockNode):
         )
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
-        return names & {"mode", "sample_time", "subscribers", "age_limit"}
+        fixed = {"mode", "sample_time", "subscribers", "age_limit", "force_control"}
+        return {name for name in names if name in fixed or name.startswith("touch.")}
 
     def check(self, parameters: FeedbackNodeParameters) -> None:
         """Refuse the half of a controller, and one that cannot take over where the loop is."""
@@ -88,24 +105,46 @@ class FeedbackNode(BlockNode):
 
     def restart_law(self) -> None:
         """Begin with the controller at rest."""
-        self.law = Feedback(self.parameters)
-        self.rate = RateWatch(self.parameters.sample_time)
-        self.armed = self.parameters.controller == "none"
+        p = self.parameters
+        self.law = Feedback(p)
+        self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
+        self.rate = RateWatch(p.sample_time)
+        self.armed = not self._has_a_rate()
+
+    def _has_a_rate(self) -> bool:
+        """Say whether the law is made for one sample time."""
+        return self.parameters.controller != "none" or self.parameters.force_control
 
     def start(self) -> None:
         self._take_file()
         super().start()
         self.restart()
         p = self.parameters
-        if p.controller != "none" and not p.certified:
+        self._waiting = None
+        if p.force_control:
+            self.expected = Sample()
+            self._expected_at = -math.inf
+            self._expectations = self.create_subscription(
+                Sample, "expected", self._on_expected, LATCHED
+            )
+        elif p.controller != "none" and not p.certified:
             self.get_logger().warning(
                 f"controller '{p.name}' ({p.controller_file or 'from parameters'}) is not certified: nothing "
                 "says that the loop is stable with this finger"
             )
 
+    def stop(self) -> None:
+        if self._expectations:
+            self.destroy_subscription(self._expectations)
+            self._expectations = None
+
     def apply(self) -> None:
         if not self._take_file():
-            self.law = self._started(self.parameters)
+            p = self.parameters
+            self.law = self._started(p)
+            state = self.touch.state
+            self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
+            self.touch.state = state
 
     def _started(self, parameters: FeedbackNodeParameters) -> Feedback:
         """Return the law of `parameters`, started where the loop is; ValueError when it cannot be."""
@@ -140,19 +179,79 @@ class FeedbackNode(BlockNode):
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()
         p = self.parameters
-        return wrong, {**figures, "controller": p.name, "certified": p.certified}
+        figures |= {"controller": p.name, "certified": p.certified}
+        if p.force_control:
+            figures |= {"controller": "force control", "certified": False, "push": self.touch.push}
+            if self._waiting:
+                wrong = wrong or (
+                    f"sample {self._waiting.number} waits for '{self.resolve_topic_name('expected')}': runs "
+                    "'feedforward' with `compensator: sensorless`?"
+                )
+        return wrong, figures
+
+    def _on_expected(self, expected: Sample) -> None:
+        if not is_physical(expected.value, LARGEST_DEFLECTION):
+            self.get_logger().error(
+                f"'expected' sample {expected.number} is {expected.value}, must be finite and within "
+                f"±{LARGEST_DEFLECTION:g} m; ignored",
+                throttle_duration_sec=1.0,
+            )
+            return
+        self.expected = expected
+        self._expected_at = time.monotonic()
+        if self._waiting:
+            self._on_sample(self._waiting)
+
+    def _on_sample(self, sample: Sample) -> None:
+        """Let a sample in lock-step wait for what is expected of it; sample 0 is that of a finger at rest."""
+        self._waiting = None
+        if self._expectations and self.parameters.mode == "lockstep":
+            is_new = self.sequence.classify(sample.number) == NEW
+            if is_new and self.expected.number != sample.number:
+                self._waiting = sample
+                return
+            if sample.number == 0:
+                self.expected = Sample()
+        super()._on_sample(sample)
 
     def compute(self, sample: Sample, answer: Sample) -> bool:
         self.deflection = sample.value
         if self.parameters.mode == "free_running" and not self._is_in_time():
             return False
-        answer.value = self.law.step(self.reference[sample.number], sample.value)
-        answer.by_controller = self.parameters.controller != "none"
+        reference = self.reference[sample.number]
+        answer.by_controller = self._has_a_rate()
+        if not self.parameters.force_control:
+            answer.value = self.law.step(reference, sample.value)
+            return True
+        if not self._is_expected():
+            return False
+        answer.value = self.touch.step(
+            reference, sample.value, self.expected.value, self.reference.max_force
+        )
+        if sample.number % max(1, round(PUSH_PERIOD / self.parameters.sample_time)) == 0:
+            push = Sample(header=sample.header, number=sample.number, period=PUSH_PERIOD)
+            push.value = self.touch.push
+            self.pushes.publish(push)
         return True
+
+    def _is_expected(self) -> bool:
+        """Say whether what is expected is known: in lock-step it is, running free it may be too old."""
+        if self.parameters.mode == "lockstep":
+            return True
+        now = time.monotonic()
+        if self._expected_at == -math.inf:
+            self._expected_at = now  # the feedforward is heard once it has a command
+        age, limit = now - self._expected_at, self.parameters.age_limit
+        if age > limit:
+            self.trip(
+                f"'expected' has not come for {age:.2g} s, must come within {limit:g} s: runs 'feedforward' with "
+                "`compensator: sensorless`?"
+            )
+        return age <= limit
 
     def _is_in_time(self) -> bool:
         """Say whether the loop keeps its sample time; a loop that did and no longer does is at fault."""
-        if self.parameters.controller == "none":
+        if not self._has_a_rate():
             return True
         period = self.rate.see(time.monotonic())
         if not period:

@@ -3,7 +3,8 @@
 
 in:  command (Sample, m), state (FingerState: the voltage that is applied when this node starts),
      temperature (sensor_msgs/Temperature, °C) with `compensator: sensorless`
-out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator
+out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator;
+     expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later
 
 Running free, a command that stays away is held and then ramped to rest, the voltage nearest to 0 V, where
 it stays until `~/reset`. When the node is deactivated, shut down or stopped by a signal, the voltage ramps to
@@ -28,7 +29,7 @@ from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode, seconds
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
-from piezo_control.nodes.qos import SAMPLE
+from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.safety import (
     FAULT,
     HIGHEST_DEGC,
@@ -54,6 +55,7 @@ class FeedforwardNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__()
+        self.expectations = self.create_publisher(Sample, "expected", LATCHED)
         self.watchdog = self.create_steady_timer(RAMP_PERIOD, self._watch, autostart=False)
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
@@ -180,11 +182,20 @@ class FeedforwardNode(BlockNode):
                 self.law.pause(sample.number - self.last.number - 1)
             answer_to = self.law.lead if sample.by_controller else self.law.step
             answer.value = answer_to(sample.value, degc, share)
+            self._expect(sample)
         else:
             answer.value = self.law.step(sample.value, share)
         self.moved = now
         answer.limited = self.law.clipped > clipped
         return True
+
+    def _expect(self, sample: Sample) -> None:
+        """Tell what the next reading is if nobody pushes the tip; before the voltage that leads to it."""
+        assert isinstance(self.law, Sensorless)
+        expected = Sample(header=sample.header, number=sample.number + 1)
+        expected.period = self.parameters.sample_time
+        expected.value = self.law.predicted
+        self.expectations.publish(expected)
 
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()

@@ -3,14 +3,17 @@
 
 actions:  grip (Grip: opening m, max_force N, speed m/s); where control_msgs is installed, ~/gripper_cmd
           (ParallelGripperCommand or GripperCommand)
-in:       FINGER/state (FingerState) of both fingers, ~/joint_commands (sensor_msgs/JointState),
+in:       FINGER/state (FingerState) and FINGER/push (Sample, N) of both fingers,
+          ~/joint_commands (sensor_msgs/JointState),
           ~/joint_trajectory (trajectory_msgs/JointTrajectory)
-out:      FINGER/reference_profile (Profile, m) of both fingers, joint_states (sensor_msgs/JointState)
+out:      FINGER/reference_profile (Profile, m, with the force limit) of both fingers,
+          joint_states (sensor_msgs/JointState)
 services: ~/home, ~/release, ~/stop, ~/zero, ~/reset (std_srvs/Trigger)
 
 One goal at a time; a new one takes over from the moving fingers, and the old one is aborted. A goal
-ends when the opening is reached or, closing, when the force is: both are successes. What the action's
-end leaves is a held reference: a gripper that loses its goal, its client or this node never drops what
+ends when the opening is reached or, closing, when the force is, with both fingers at rest: both are
+successes. The force is held in the fingers' own loops (`force_control`); fingers without take goals by
+position alone. What the action's end leaves is a held reference: a gripper that loses its goal, its client or this node never drops what
 it holds, and never moves on. A finger that stops by itself is at 0 V, and is told to stay at deflection
 0 when it starts again.
 """
@@ -18,6 +21,7 @@ it holds, and never moves on. A finger that stops by itself is at 0 V, and is to
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -30,6 +34,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from piezo_control.gripper import (
+    HOLD_BEYOND,
     Goal,
     GripperParameters,
     Motion,
@@ -50,15 +55,16 @@ from piezo_control.nodes.faces.joint_commands import JointCommands
 from piezo_control.nodes.faces.joint_states import JointStates
 from piezo_control.nodes.faces.services import Services
 from piezo_control.nodes.profile_input import to_message
-from piezo_control.nodes.qos import LATCHED
+from piezo_control.nodes.qos import LATCHED, NEWEST
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
-from piezo_gripper_msgs.msg import FingerState
+from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 WATCH_PERIOD = 0.1  # s
 DELIVERY_TIMEOUT = Duration(seconds=0.5)
 VELOCITY_WINDOW = 0.1  # s of the finger's time: the sensor's quantum of 10 nm is 0.1 µm/s then
+PUSH_TIMEOUT = 0.5  # s of the finger's time; pushes come every 10 ms of it
 LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second
 PHASES = {
     FingerState.IDLE: "IDLE",
@@ -128,8 +134,14 @@ class Finger:
         self._way: deque[tuple[float, float]] = (
             deque()
         )  # time (s) and deflection (m), the last ones
+        self.push = (
+            math.nan
+        )  # N, of the object, that bends the finger open; NaN: it does not feel any
+        self.max_force = 0.0  # N, of the goal; 0: the finger's own limit
+        self._felt = 0  # number of the sample at which it felt that
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
         self._states = node.create_subscription(FingerState, f"{name}/state", self._take, LATCHED)
+        self._pushes = node.create_subscription(Sample, f"{name}/push", self._feel, NEWEST)
 
     @property
     def time(self) -> float:
@@ -146,11 +158,6 @@ class Finger:
         """How fast the finger went (m/s) over the last `VELOCITY_WINDOW`."""
         (begin, start), (end, here) = self._way[0], self._way[-1]
         return (here - start) / (end - begin) if end > begin else 0.0
-
-    @property
-    def push(self) -> float:
-        """Force of the object on the tip (N), positive where it bends the finger open."""
-        return -self.state.tip_force
 
     def place(self) -> float:
         """Return where the reference is (m); before the first one, where the finger is."""
@@ -173,7 +180,7 @@ class Finger:
             return
         if reference.linear:
             reference = reference.part(self.time, self.time + LEASE)
-        self._profiles.publish(to_message(reference))
+        self._profiles.publish(to_message(reference, self.max_force))
 
     def silence(self) -> str:
         """Return that the finger is taken for dead, or nothing."""
@@ -190,7 +197,21 @@ class Finger:
         if self.state.phase != FingerState.RUNNING:
             text = f" ({self.state.text})" if self.state.text else ""
             return f"finger '{self.name}' is {PHASES[self.state.phase]}{text}, must be RUNNING"
+        samples = self.state.samples - self._felt
+        if not self.numbness() and samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
+            topic = self._node.resolve_topic_name(f"{self.name}/push")
+            return f"finger '{self.name}' feels no more: nothing on '{topic}' for {samples} samples"
         return ""
+
+    def numbness(self) -> str:
+        """Return why this finger cannot hold a force, or nothing."""
+        if math.isfinite(self.push):
+            return ""
+        topic = self._node.resolve_topic_name(f"{self.name}/push")
+        return (
+            f"finger '{self.name}' feels no force (nothing on '{topic}'): its feedback needs `force_control: true`, "
+            "or leave max_force at 0 to go by position alone"
+        )
 
     def reset(self) -> None:
         """Ask all nodes of the finger to leave their faults; what one of them refuses is logged."""
@@ -212,6 +233,11 @@ class Finger:
         self._profiles.wait_for_all_acked(DELIVERY_TIMEOUT)
         self._node.destroy_publisher(self._profiles)
         self._node.destroy_subscription(self._states)
+        self._node.destroy_subscription(self._pushes)
+
+    def _feel(self, push: Sample) -> None:
+        self.push = push.value
+        self._felt = push.number
 
     def _take(self, state: FingerState) -> None:
         restarted = self.state is not None and state.samples < self.state.samples
@@ -219,6 +245,7 @@ class Finger:
         self.heard = monotonic()
         if restarted:
             self._way.clear()
+            self.push = math.nan
         if not self._way or self.time > self._way[-1][0]:
             self._way.append((self.time, state.deflection))
         while len(self._way) > 2 and self.time - self._way[1][0] >= VELOCITY_WINDOW:
@@ -306,6 +333,9 @@ class GripperNode(FingerNode):
             raise ValueError("the gripper is not active")
         goal = check_goal(self.parameters, opening, max_force, speed)
         self._check_fingers()
+        for finger in self.fingers:
+            if max_force and (numbness := finger.numbness()):
+                raise ValueError(numbness)
         return goal
 
     def check_trajectory(self, waypoints: Sequence[Waypoint]) -> Goal:
@@ -319,6 +349,8 @@ class GripperNode(FingerNode):
         if self.asker is not asker:
             self._finish(failure("a new goal takes over"))
         self.motion = Motion(self.parameters, goal, [finger.place() for finger in self.fingers])
+        for finger in self.fingers:
+            finger.max_force = goal.max_force
         self.asker = asker
 
     def halt(self, reason: str) -> None:
@@ -347,7 +379,7 @@ class GripperNode(FingerNode):
         return Measured(
             opening_of(self.parameters, [finger.deflection for finger in self.fingers]),
             -sum(finger.velocity for finger in self.fingers),
-            force_of([finger.state.tip_force for finger in self.fingers]),
+            force_of([finger.push for finger in self.fingers]),
         )
 
     def _check_fingers(self) -> None:
@@ -380,7 +412,7 @@ class GripperNode(FingerNode):
         outcome = motion.decide(
             [f.time for f in self.fingers],
             [f.deflection for f in self.fingers],
-            [f.state.tip_force for f in self.fingers],
+            [f.push for f in self.fingers],
         )
         if outcome is not None:
             self._halt_motion(outcome)
@@ -396,10 +428,15 @@ class GripperNode(FingerNode):
     # --- ends ---------------------------------------------------------------------------------------
 
     def _halt_motion(self, outcome: Outcome) -> None:
-        """Hold the fingers where their references were at the newest states, and end the motion."""
+        """Hold the fingers where their references are, or where the tips were stopped, and end the motion."""
         for finger in self.fingers:
             if finger.reference is not None:
-                finger.follow(hold(finger.place()))
+                place = finger.place()
+                if not outcome.reached_goal:
+                    # Ahead of a tip that feels, to go on pushing; no further ahead of one that does not.
+                    ahead = 0.0 if finger.numbness() else HOLD_BEYOND
+                    place = min(place, finger.deflection + ahead)
+                finger.follow(hold(place))
         self._finish(outcome)
 
     def _give_up(self, asker: Asker) -> None:

@@ -12,6 +12,7 @@ from piezo_control.safety import SafetyParameters
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.servo.parameters import ServoParameters
 from piezo_control.thermometer import ThermometerParameters
+from piezo_control.touch import TouchParameters
 
 MODES = ("lockstep", "free_running")
 
@@ -72,6 +73,12 @@ class FeedbackNodeParameters(FeedbackParameters, LoopParameters):
         "",
         "parameter file to take the whole controller from, the name of a shipped one ('robust'), or 'none'",
     )
+    force_control: bool = parameter(
+        False,
+        "a force limit acts in the loop, in place of the controller; needs the feedforward's "
+        "`compensator: sensorless`, whose models say where a tip would be that nobody pushes",
+    )
+    touch: TouchParameters = group(TouchParameters)
 
 
 @dataclass(frozen=True)
@@ -119,7 +126,7 @@ class ServoNodeParameters(ServoParameters):
 
 RECORDED = (
     "reference", "reference_profile", "reference_waveform", "deflection", "command", "voltage", "samples",
-    "temperature", "tip_force", "tip_force_profile", "tip_force_waveform", "state",
+    "temperature", "tip_force", "tip_force_profile", "tip_force_waveform", "push", "state",
 )  # fmt: skip
 """Topics of a finger."""
 

@@ -3,21 +3,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from rclpy.node import Node
 
 from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.profile import Profile, SampledSignal, Signal
+from piezo_control.safety import LARGEST_FORCE
 from piezo_control.waveform import SHAPES, Waveform
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 
-def to_message(profile: Profile) -> ProfileMessage:
-    """Return the message that says `profile`."""
+def to_message(profile: Profile, max_force: float = 0.0) -> ProfileMessage:
+    """Return the message that says `profile`, on the way of which a finger pushes with `max_force` (N) at most."""
     return ProfileMessage(
+        max_force=max_force,
         time=profile.time.tolist(),
         value=profile.value.tolist(),
         interpolation=ProfileMessage.LINEAR if profile.linear else ProfileMessage.HOLD,
@@ -49,6 +52,8 @@ class ProfileInput:
         self._node = node
         self._topic = topic
         self._largest = largest
+        self.max_force = math.inf
+        """Force (N) that the sender allows; infinite where it says nothing."""
         self._sampled = SampledSignal(Profile([0.0], [0.0]), sample_time)
         node.create_subscription(Sample, topic, self._on_value, SETPOINT)
         node.create_subscription(ProfileMessage, f"{topic}_profile", self._on_profile, LATCHED)
@@ -71,7 +76,11 @@ class ProfileInput:
 
     def _on_profile(self, message: ProfileMessage) -> None:
         linear = message.interpolation == ProfileMessage.LINEAR
-        self._take(f"{self._topic}_profile", lambda: Profile(message.time, message.value, linear))
+        self._take(
+            f"{self._topic}_profile",
+            lambda: Profile(message.time, message.value, linear),
+            message.max_force,
+        )
 
     def _on_waveform(self, message: WaveformMessage) -> None:
         def make() -> Waveform:
@@ -86,7 +95,7 @@ class ProfileInput:
 
         self._take(f"{self._topic}_waveform", make)
 
-    def _take(self, topic: str, make: Callable[[], Signal]) -> None:
+    def _take(self, topic: str, make: Callable[[], Signal], max_force: float = 0.0) -> None:
         try:
             signal = make()
             if not signal.largest <= self._largest:
@@ -94,8 +103,11 @@ class ProfileInput:
                     f"value is up to {signal.largest:g}, must be within ±{self._largest:g}; the unit is that "
                     "of the topic, m or N"
                 )
+            if not 0.0 <= max_force <= LARGEST_FORCE:
+                raise ValueError(f"max_force is {max_force:g}, must be in [0, {LARGEST_FORCE:g}] N")
         except ValueError as error:
             self._node.get_logger().error(f"'{topic}' ignored: {error}")
             return
         self._sampled = SampledSignal(signal, self._sampled.sample_time)
+        self.max_force = max_force or math.inf
         self._on_change()

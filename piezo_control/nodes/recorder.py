@@ -48,6 +48,7 @@ FINGER = {
     "voltage": (SAMPLE_TYPE, SAMPLE),
     "samples": (BLOCK_TYPE, SAMPLE),
     "temperature": (TEMPERATURE_TYPE, SAMPLE),
+    "push": (SAMPLE_TYPE, SAMPLE),
     "tip_force": (SAMPLE_TYPE, SAMPLE),
     "tip_force_profile": (PROFILE_TYPE, LATCHED),
     "tip_force_waveform": (WAVEFORM_TYPE, SAMPLE),

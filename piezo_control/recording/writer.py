@@ -151,7 +151,7 @@ def write_recording(
 
 def _profile(bag: BagWriter, profile: Profile) -> bytes:
     message = bag.typestore.types[PROFILE_TYPE](
-        _header(bag, 0), LINEAR if profile.linear else 0, profile.time, profile.value
+        _header(bag, 0), LINEAR if profile.linear else 0, profile.time, profile.value, max_force=0.0
     )
     return bytes(bag.typestore.serialize_cdr(message, PROFILE_TYPE))
 
