@@ -124,7 +124,10 @@ def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters
     """
     folders = [*([folder] if folder else []), shared_folder() / "params"]
     named = [place / f"feedback_{name}.yaml" for place in folders]
-    path = next((path for path in [*named, Path(name)] if path.is_file()), None)
+    try:
+        path = next((path for path in [*named, Path(name)] if path.is_file()), None)
+    except OSError:  # a name that no file can have
+        path = None
     if path is None:
         files = sorted(path for place in folders for path in place.glob("feedback_*.yaml"))
         known = ", ".join(dict.fromkeys(path.stem.removeprefix("feedback_") for path in files))

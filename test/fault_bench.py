@@ -79,7 +79,9 @@ class Processes(NodeProcesses):
             return [sys.executable, str(Path(__file__).with_name("fault_plant.py"))]
         prefix = []
         if name == "feedback" and self.network:
-            prefix = ["ip", "netns", "exec", self.network.name]
+            # With shared memory of its own too, past which two machines cannot talk either.
+            apart = 'mount -t tmpfs none /dev/shm && exec "$0" "$@"'
+            prefix = ["ip", "netns", "exec", self.network.name, "sh", "-c", apart]
         return [*prefix, *super().program(name)]
 
 

@@ -94,7 +94,7 @@ def let_go_wrong(bench: Bench, cores: int) -> None:
             bench.finger.phase == FingerState.FAULT
         ):  # of a machine that is too busy for its time limits
             bench.call(Trigger, "cantilever/reset", Trigger.Request())
-        return bench.samples > moving
+        return bench.samples > moving and bench.finger.phase == FingerState.RUNNING
 
     if not bench.wait(START, is_running):
         bench.broken(f"the loop did not begin to run: '{bench.finger.text}'")

@@ -178,4 +178,4 @@ def test_command_line_prints_the_figures(tmp_path, capsys):
     assert monte_carlo.main([str(tmp_path / "none.yaml"), "--out", str(tmp_path)]) == 2
     assert "none.yaml' is no file, and not one of the known" in capsys.readouterr().err
     assert monte_carlo.main(["paper", "--out", str(tmp_path), "--workers", "0"]) == 2
-    assert "'workers' is 0, must be 1 or more" in capsys.readouterr().err
+    assert "'workers' is 0, must be in [1, 10000]" in capsys.readouterr().err

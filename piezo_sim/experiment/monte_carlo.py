@@ -131,13 +131,13 @@ def monte_carlo(
     Chunks already in `folder` are not run again; `progress` is called with the draws done and all.
     Raises ParameterError when `folder` holds draws of another study.
     """
-    for name, least, value in (
-        ("draws", 1, draws),
-        ("workers", 1, workers),
-        ("seed", 0, study.seed),
+    for name, least, most, value in (
+        ("draws", 1, 10**8, draws),
+        ("workers", 1, 10**4, workers),
+        ("seed", 0, 2**63 - 1, study.seed),
     ):
-        if value is not None and value < least:
-            raise ParameterError(f"'{name}' is {value}, must be {least} or more")
+        if value is not None and not least <= value <= most:
+            raise ParameterError(f"'{name}' is {value}, must be in [{least}, {most}]")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     study_file = folder / "study.txt"
@@ -188,7 +188,7 @@ def main(arguments: list[str] | None = None) -> int:
         result = monte_carlo(
             study, given.draws, given.out, _show_progress, given.workers, given.scheduler
         )
-    except ParameterError as error:
+    except (ParameterError, OSError) as error:
         print(f"monte_carlo: {error}", file=sys.stderr)
         return 2
     print(f"{'figure':26}{'median':>12}{'95 %':>12}{'worst':>12}")

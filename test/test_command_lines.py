@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any words after a command: it is done, it fails or it refuses, by exit code and in words, never with a traceback.
+
+What takes long and lies behind the reading of the command line is left out here; other tests run it.
+"""
+
+import contextlib
+import functools
+import io
+import itertools
+import re
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from piezo_control.design import cli as design
+from piezo_control.design.synthesis import SynthesisError
+from piezo_control.identification import cli as identification
+from piezo_control.parameters import ParameterError
+from piezo_control.servo import commission
+from piezo_sim.experiment import cli as experiment
+from piezo_sim.experiment import monte_carlo
+from piezo_sim.experiment.cases import params_folder
+
+NUMBERS = (
+    "0",
+    "-1",
+    "1",
+    "1e-3",
+    "0.5",
+    "nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "5e-324",
+    "9" * 400,
+    "1e999",
+)
+WORDS = (
+    "",
+    " ",
+    "-",
+    "--",
+    "robust",
+    "step",
+    "µm",
+    "\udcff",
+    "a" * 5000,
+    "{x}",
+    "[bold]",
+    "%s",
+    "/nowhere/at/all",
+)
+
+
+def leave_out(*_, error=SynthesisError, **__):
+    raise error("left out")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder of files as one may name by mistake; it is the working directory of the commands."""
+    folder = tmp_path_factory.mktemp("here")
+    (folder / "empty").write_bytes(b"")
+    (folder / "binary").write_bytes(bytes(range(256)))
+    (folder / "list.yaml").write_text("[1, 2]\n")
+    (folder / "deep.yaml").write_text("[" * 400)
+    (folder / "node.yaml").write_text("/**/feedback: {ros__parameters: {sample_time: text}}\n")
+    (folder / "nan.csv").write_text("time,voltage,deflection\n" + "nan,nan,nan\n" * 20)
+    time = np.arange(40) * 1e-3
+    rows = np.column_stack([time, np.sin(50 * time), 1e-6 * np.sin(50 * time)])
+    np.savetxt(
+        folder / "short.csv", rows, delimiter=",", header="time,voltage,deflection", comments=""
+    )
+    (folder / "folder").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(experiment, "run_into", lambda *_: None)
+        patch.setattr(design, "synthesize", leave_out)
+        patch.setattr(monte_carlo, "run_draws", functools.partial(leave_out, error=ParameterError))
+        patch.setattr(commission, "commission", leave_out)
+        yield sorted(path.name for path in folder.iterdir())
+
+
+def run(main, words):
+    """Return exit code and words of a command, as it would be in a process of its own."""
+    said = io.TextIOWrapper(io.BytesIO(), "utf-8", errors="backslashreplace", write_through=True)
+    out = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["command", *words])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):
+            try:
+                code = main()
+            except SystemExit as stopped:
+                code = stopped.code or 0
+    return code, said.buffer.getvalue().decode(), out.buffer.getvalue().decode()
+
+
+def options(main, commands):
+    """Return the options that the helps of a command and of its commands name."""
+    helps = [run(main, [*command, "--help"])[2] for command in commands]
+    return sorted(
+        {word for text in helps for word in re.findall(r"--[a-z][a-z-]+", text)} - {"--help"}
+    )
+
+
+COMMANDS = {
+    "experiment": (experiment.main, [["step"], ["all"], ["analyse"], ["compare"], ["recover"], []]),
+    "identify": (
+        identification.main,
+        [["hysteresis"], ["dynamics"], ["drift"], ["hysteresis", "short.csv"], []],
+    ),
+    "synthesize": (design.main, [[], [str(params_folder() / "synthesis_robust.yaml")]]),
+    "monte_carlo": (monte_carlo.main, [[], ["robust"]]),
+    "commission": (commission.main, [[]]),
+}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_any_words_end_in_an_exit_code(name, files):
+    main, commands = COMMANDS[name]
+    known = options(main, commands)
+    word = st.sampled_from((*NUMBERS, *WORDS, *files))
+    option = st.tuples(st.sampled_from(known), word)
+    numbers = itertools.count()
+
+    @settings(
+        max_examples=60,
+        deadline=None,
+        database=None,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    @given(st.sampled_from(commands), st.lists(word, max_size=2), st.lists(option, max_size=3))
+    def words_of_any_kind(command, positional, given_options):
+        given_words = [*command, *positional, *itertools.chain(*given_options)]
+        if "--out" not in given_words:
+            given_words += ["--out", f"new{next(numbers)}"]
+        code, said, _ = run(main, given_words)
+        assert code in (0, 1, 2), given_words
+        assert said or code == 0, given_words
+        assert "Traceback" not in said
+
+    words_of_any_kind()
