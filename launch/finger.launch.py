@@ -12,6 +12,7 @@ ARGUMENTS = {
     "controller": ("robust", "controller: a shipped name, or the path of a parameter file"),
     "mode": ("lockstep", "lockstep or free_running"),
     "sample_time": ("0.0001", "sample time in s; that of the controller's design"),
+    "state_period": ("0.1", "how often the finger's state is published, in s"),
 }
 
 
@@ -23,7 +24,13 @@ def generate_launch_description() -> LaunchDescription:
         "temperature": [common],
         "feedforward": [sampled],
         "feedback": [{**common, "controller_file": controller}],
-        "cantilever": [{**sampled, "temperature_lockstep": True}],
+        "cantilever": [
+            {
+                **sampled,
+                "temperature_lockstep": True,
+                "state_period": LaunchConfiguration("state_period"),
+            }
+        ],
     }
     return LaunchDescription(
         [

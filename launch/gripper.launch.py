@@ -13,6 +13,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 FINGERS = ("left", "right")  # the default of the gripper node; lists do not pass launch whole
+STATE_PERIOD = "0.01"  # s, as often as the gripper publishes joint states
 ARGUMENTS = {
     "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
     "joint_states": (
@@ -40,7 +41,10 @@ def generate_launch_description() -> LaunchDescription:
                 for name, (value, text) in ARGUMENTS.items()
             ),
             *(
-                IncludeLaunchDescription(finger, launch_arguments={"namespace": side}.items())
+                IncludeLaunchDescription(
+                    finger,
+                    launch_arguments={"namespace": side, "state_period": STATE_PERIOD}.items(),
+                )
                 for side in FINGERS
             ),
             Node(

@@ -119,6 +119,9 @@ class ServoNodeParameters(ServoParameters):
         1e-2, "how often a single deflection, command and voltage is published, for people", unit="s",
         low=1e-3, high=10.0,
     )  # fmt: skip
+    state_period: float = parameter(
+        0.1, "how often `state` is published", unit="s", low=5e-3, high=1.0
+    )
     tolerance: float = parameter(
         0.5e-6, "on target: the error stays so small", unit="m", low=0.0, high=1e-3
     )

@@ -33,7 +33,7 @@ from piezo_control.servo.driver import DriverError, open_driver
 from piezo_control.servo.loop import Samples, Servo
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 
-STATE_PERIOD = 0.1  # s
+TARGET_TIME = 0.1  # s that the error stays small before a finger is on target
 PHASES = {
     NORMAL: FingerState.RUNNING,
     HOLDING: FingerState.HOLDING,
@@ -60,7 +60,7 @@ class ServoNode(FingerNode):
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
         )
-        self.create_steady_timer(STATE_PERIOD, self._publish_state)
+        self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.phase = FingerState.IDLE
         self._last: Samples | None = None
         self._told = 0.0
@@ -109,6 +109,7 @@ class ServoNode(FingerNode):
         self.servo.start()
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()
+        self.teller.timer_period_ns = round(p.state_period * 1e9)
         self.drain.timer_period_ns = round(p.block_period * 1e9)
         self.drain.reset()
         self.get_logger().info(
@@ -191,7 +192,7 @@ class ServoNode(FingerNode):
         self._errors.append(
             (samples.instant[-1], float(np.max(error, where=error >= 0, initial=0)))
         )
-        while self._errors[0][0] < samples.instant[-1] - STATE_PERIOD:
+        while self._errors[0][0] < samples.instant[-1] - TARGET_TIME:
             self._errors.pop(0)
         if samples.instant[-1] - self._told >= self.parameters.sample_period:
             self._told = samples.instant[-1]

@@ -48,7 +48,6 @@ from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 from piezo_sim.nodes.parameters import CantileverNodeParameters
 from piezo_sim.plant.cantilever import Cantilever
 
-STATE_PERIOD = 0.1  # s
 JITTER_WINDOW = 1000  # periods: to sort more takes longer than a period
 RETRY_PERIOD = 0.1  # s
 PHASES = {HOLDING: FingerState.HOLDING, RAMPING: FingerState.RAMPING, FAULT: FingerState.FAULT}
@@ -68,7 +67,7 @@ class CantileverNode(FingerNode):
         self.create_subscription(Fault, "fault", self._on_fault, FAULTS)
         self.faults: dict[str, str] = {}
         self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
-        self.create_steady_timer(STATE_PERIOD, self._publish_state)
+        self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.watchdog = self.create_steady_timer(RETRY_PERIOD, self._watch, autostart=False)
         self.tick = self.create_steady_timer(1.0, self._tick, autostart=False)
         self.phase = FingerState.IDLE
@@ -98,6 +97,7 @@ class CantileverNode(FingerNode):
 
     def start(self) -> None:
         self._reset()
+        self.teller.timer_period_ns = round(self.parameters.state_period * 1e9)
         self._enter(FingerState.WAITING)
         self.heard = self.begun = monotonic()
         if wrong := self._wrong():

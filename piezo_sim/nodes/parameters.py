@@ -30,6 +30,9 @@ class CantileverNodeParameters(CantileverParameters, LoopParameters, SafetyParam
     clock_period: float = parameter(
         1e-2, "how often `clock` is published", unit="s", low=1e-6, high=10.0
     )
+    state_period: float = parameter(
+        0.1, "how often `state` is published", unit="s", low=5e-3, high=1.0
+    )
     reply_timeout: float = parameter(
         2.0, "lock-step: how long an answer may take once the loop has run", unit="s",
         low=0.2, high=3600.0,
