@@ -22,7 +22,7 @@ def example(name, *arguments):
 def test_step_on_the_engine(tmp_path):
     words = example("step_on_the_engine.py", str(tmp_path / "step.png"))
     (settled,) = re.findall(r"after ([\d.]+) ms", words)
-    assert float(settled) <= 5.5  # what params/synthesis_robust.yaml asks for
+    assert float(settled) <= 6.0  # what params/synthesis_robust.yaml asks for
     assert (tmp_path / "step.png").stat().st_size > 1000
 
 

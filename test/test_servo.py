@@ -202,10 +202,11 @@ def test_polarity_zero_and_scale_of_sensor_are_undone():
 
 
 def test_a_loop_that_oscillates_ends_at_rest():
-    """Three more samples of delay turn `robust`, whose delay margin is 0.26 ms, unstable."""
+    """Three more samples of delay turn `fast`, whose delay margin is 0.26 ms, unstable."""
     plant = CantileverParameters()
     sensor = replace(plant.sensor, delay_samples=4)
     bench = Bench(
+        read_controller("fast"),
         plant=replace(plant, sensor=sensor),
         model_tolerance=1e-3,
         sensor_high=1e-3,

@@ -94,7 +94,7 @@ def test_smallest_gamma_of_the_fingers_coprime_problem():
 
 
 def test_smallest_gamma_equals_hinfsyn_of_python_control():
-    p = problem("robust")
+    p = problem("fast")
     finger = to_w_plane(delayed_finger(p.finger), p.finger.sample_time / synthesis.TIME_UNIT)
     plant = generalised_plant(finger, *realised_weights(p.weights))
     without = plant.d.copy()
@@ -169,7 +169,7 @@ def test_prefilter_passes_a_constant_unchanged():
     assert abs(reference[0]) < 1e-6 * abs(feedback[0])
 
 
-@pytest.mark.parametrize("name", ["paper", "robust"])
+@pytest.mark.parametrize("name", ["paper", "fast"])
 def test_shipped_controller_is_what_its_problem_gives(name):
     path = PARAMS / f"feedback_{name}.yaml"
     shipped = build(FeedbackParameters, load(path, "feedback"), str(path))

@@ -9,7 +9,8 @@ responses and the norms the weights ask about. :func:`certify` compares them wit
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,18 +24,26 @@ from piezo_control.design.linear_loop import (
     finger_response,
     fingers,
     frequency_grid,
+    held_voltage,
     margins,
+    noise_gain,
     respond,
     settling,
     spectral_radius,
     static_gain,
 )
 from piezo_control.design.problem import DesignProblem, TransferFunction
+from piezo_control.design.robustness import Proof, prove, unmodelled_weight
 from piezo_control.feedback import FeedbackParameters
 
 STEP_BAND = 0.05
 RECORD_SETTLING_TIMES = 4.0
 DRIFT_STEP_DEGC = 10.0
+PARTS = 8
+PROOF_SLACK = 1.01
+"""The first bound to be tried is so much above what the samples have."""
+BOUNDS = 6
+"""Bounds to be tried, from there to what is required."""
 GAMMA_AGREEMENT = 1.05
 """The recomputed norm may exceed the solver's gamma by this factor, for truncation and integrator."""
 
@@ -44,7 +53,9 @@ class Figures(NamedTuple):
 
     `settling`, `overshoot` and `static_error` belong to a reference step; the peaks are those of |S|,
     |T|, |K S| and |G S|; `force_settling` is how long a force step leaves more than 5 % of its open-loop
-    static deflection (s), `drift` the largest deflection after a temperature step (m/°C).
+    static deflection (s), `drift` the largest deflection after a temperature step (m/°C). `noise_gain` is
+    the command's scatter per scatter of the readings, `unmodelled` the peak of |K S| W, below 1 when every
+    mode that nobody modelled leaves the loop stable.
     """
 
     settling: np.ndarray
@@ -56,6 +67,8 @@ class Figures(NamedTuple):
     disturbance_peak: np.ndarray
     force_settling: np.ndarray
     drift: np.ndarray
+    noise_gain: np.ndarray
+    unmodelled: np.ndarray
 
 
 class Box:
@@ -76,6 +89,7 @@ class Box:
     ) -> None:
         self.problem = problem
         self.fingers = _sample_box(problem, resonance, damping, gain, spread)
+        self.sides = (resonance, damping, gain, spread)
         self.outer = _sample_box(
             problem, 2 * resonance - 1, 3, 3, problem.uncertainty.resonance_stable
         )
@@ -85,6 +99,7 @@ class Box:
         self.frequency = frequency_grid(step, (1 - reach) * omega, (1 + reach) * omega, points)
         self.z = np.exp(1j * self.frequency * step)
         self.plant = finger_response(self.fingers, self.z)
+        self.weight = unmodelled_weight(problem.uncertainty, step, self.frequency * step)
         self.samples = math.ceil(RECORD_SETTLING_TIMES * problem.specification.settling_time / step)
 
     def radius(self, controller: FeedbackParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -113,12 +128,28 @@ class Box:
                 disturbance_peak=np.abs(self.plant * sensitivity).max(axis=1),
                 force_settling=settling(force, self.fingers.sample_time, 0.0, STEP_BAND),
                 drift=self.drift(loop),
+                noise_gain=noise_gain(loop),
+                unmodelled=np.abs(feedback * sensitivity * self.weight).max(axis=1),
             )
         return Figures(*(np.where(unstable, np.inf, value) for value in values))
 
     def step_responses(self, loop: ClosedLoop) -> np.ndarray:
         """Return the readings after a unit step of the reference, shape (nfingers, nsamples)."""
         return respond(loop, "reference", self.samples)
+
+    def intersample(self, controller: FeedbackParameters) -> np.ndarray:
+        """Return the overshoot of the tip itself after a step, between samples too: PARTS times a sample."""
+        loop = closed_loop(self.fingers, controller)
+        h = self.problem.finger.sample_time
+        states, voltage = held_voltage(self.fingers, loop, self.samples)
+        peak = states[:, 0::2].sum(axis=1).max(axis=1)
+        for part in range(1, PARTS):
+            finger = replace(self.problem.finger, sample_time=part / PARTS * h)
+            finer = _sample_box(replace(self.problem, finger=finger), *self.sides)
+            between = np.einsum("nmij,nmjk->nmik", finer.a, states.reshape(*finer.b.shape, -1))
+            tip = between[:, :, 0].sum(axis=1) + finer.b[:, :, 0].sum(axis=1)[:, None] * voltage
+            peak = np.maximum(peak, tip.max(axis=1))
+        return np.maximum(peak - 1.0, 0.0)
 
     def drift(self, loop: ClosedLoop) -> np.ndarray:
         """Return the largest deflection per degree (m/°C) after a step of the temperature.
@@ -162,6 +193,8 @@ def _required(problem: DesignProblem) -> dict[str, float]:
         "effort_peak": s.effort_peak,
         "force_settling": s.force_settling_time,
         "drift": s.drift_per_degc,
+        "noise_gain": s.noise_gain,
+        "unmodelled": 1.0 if problem.uncertainty.unmodelled_share else 0.0,
     }
 
 
@@ -286,6 +319,8 @@ _LABELS = {
     "effort_peak": ("effort peak |K S|", "", 1.0),
     "force_settling": ("force step down to 5 %", "ms", 1e3),
     "drift": ("drift after a temperature step", "µm/10 °C", 1e6 * DRIFT_STEP_DEGC),
+    "noise_gain": ("noise gain, readings to command", "", 1.0),
+    "unmodelled": ("unmodelled modes, |K S| W", "", 1.0),
 }
 
 
@@ -325,22 +360,27 @@ def certify(
                     bool(value[worst] <= required),
                 )
             )
+    far = Box(problem, 9, 3, 3, 1200, problem.uncertainty.resonance_stable).figures(controller)
+    rows += _proven_rows(problem, controller, figures, far)
     norms: dict[str, float] = {}
     if problem.weights:
         norms = weighted_norms(problem, controller)
         rows.append(_gamma_row(problem, gamma, norms["all"]))
     all_margins = box_margins(box, controller)
-    far = Box(problem, 9, 3, 3, 1200, problem.uncertainty.resonance_stable).figures(controller)
+    with np.errstate(over="ignore", invalid="ignore"):
+        between = box.intersample(controller)
     return Certificate(
         name=controller.name,
         rows=tuple(rows),
         nominal={
             **{name: float(value[centre]) for name, value in figures._asdict().items()},
             **all_margins[centre]._asdict(),
+            "intersample": float(between[centre]),
             **nominal_figures(problem, controller),
         },
         worst={
             **{name: float(value.max()) for name, value in figures._asdict().items()},
+            "intersample": float(between.max()),
             "gain_up": min(m.gain_up for m in all_margins),
             "gain_down": max(m.gain_down for m in all_margins),
             "phase_deg": min(m.phase_deg for m in all_margins),
@@ -367,6 +407,41 @@ def _stability_row(label: str, box: Fingers, radius: np.ndarray) -> Row:
     return Row(label, "", 1.0, nominal, float(radius[worst]), _describe(box, worst), is_stable)
 
 
+def _proven_rows(
+    problem: DesignProblem, controller: FeedbackParameters, inner: Figures, outer: Figures
+) -> list[Row]:
+    """Return what holds for every finger of the continuous box, by a bound and not by samples."""
+    u, allowed = problem.uncertainty, problem.specification.sensitivity_peak
+    return [
+        _proven_row(
+            "proven: |K S| W, continuous box, resonance further off",
+            float(outer.unmodelled.max()),
+            1.0,
+            lambda bound: prove(problem, controller, u.resonance_stable, unmodelled=1.0 / bound),
+        ),
+        _proven_row(
+            "proven: sensitivity peak Ms, continuous box",
+            float(inner.sensitivity_peak.max()),
+            allowed,
+            lambda bound: prove(problem, controller, u.resonance, smallest=1.0 / bound),
+        ),
+    ]
+
+
+def _proven_row(
+    label: str, sampled: float, required: float, claim: Callable[[float], Proof]
+) -> Row:
+    """Return the lowest bound, between what the samples have and what is required, that is proven."""
+    proof = Proof(False, 0, "the samples have more than is required")
+    if sampled < required:
+        lowest = min(PROOF_SLACK * max(sampled, 0.01), required)
+        for bound in np.geomspace(lowest, required, BOUNDS):
+            proof = claim(float(bound))
+            if proof.holds:
+                return Row(label, "", required, float(bound), float(bound), "every finger", True)
+    return Row(label, "", required, math.inf, math.inf, proof.why, False)
+
+
 def _gamma_row(problem: DesignProblem, gamma: float, norm: float) -> Row:
     low = gamma / (GAMMA_AGREEMENT * problem.gamma_margin)
     is_confirmed = low <= norm <= GAMMA_AGREEMENT * gamma
@@ -386,7 +461,8 @@ def nominal_figures(problem: DesignProblem, controller: FeedbackParameters) -> d
 
     ``bandwidth`` is where the response from reference to reading falls below -3 dB of its static
     value for the first time (rad/s), ``sensitivity_static`` is S(1), ``settling_2`` the settling time
-    into 2 %, ``settling_final`` that into 5 % around the final value. ``resonance_low`` and
+    into 2 %, ``settling_final`` that into 5 % around the final value. ``feedback_above`` is the largest
+    |K| from `unmodelled_from_hz` on. ``resonance_low`` and
     ``resonance_high`` are the factors on the resonance between which the loop is stable, in steps
     of 0.005 and within 0.4 to 1.6.
     """
@@ -407,12 +483,14 @@ def nominal_figures(problem: DesignProblem, controller: FeedbackParameters) -> d
     )
     with np.errstate(over="ignore", invalid="ignore"):
         step = respond(loop, "reference", samples)
+    above = frequency >= 2.0 * math.pi * problem.uncertainty.unmodelled_from_hz
     low, high = stable_resonances(problem, controller)
     return {
         "bandwidth": float(frequency[below[0]]) if below.size else math.inf,
         "sensitivity_static": abs(1.0 - final),
         "settling_2": float(settling(step, model.sample_time, 1.0, 0.02)[0]),
         "settling_final": float(settling(step, model.sample_time, final, 0.05 * abs(final))[0]),
+        "feedback_above": float(np.abs(feedback[above]).max(initial=0.0)),
         "resonance_low": low,
         "resonance_high": high,
     }

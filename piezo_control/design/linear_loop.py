@@ -247,10 +247,20 @@ def respond(
     return readings
 
 
-def commands(loop: ClosedLoop, samples: int) -> np.ndarray:
-    """Return the commands after a unit step of the reference, from rest, shape (nfingers, samples)."""
+def held_voltage(box: Fingers, loop: ClosedLoop, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return what the finger has at each sample after a unit step of the reference, from rest.
+
+    Returns
+    -------
+    states, voltage : 3-D and 2-D array with shapes (nfingers, 2 nmodes, samples), (nfingers, samples)
+        Of the modes at the sample, and behind the amplifier until the next one (as the deflection that it
+        would hold).
+    """
     states = _respond(loop, loop.b_reference, samples)
-    return np.einsum("i,nik->nk", loop.c_command, states[:, :-2]) + loop.d_reference
+    own = 2 * box.a.shape[1]
+    command = np.einsum("i,nik->nk", loop.c_command, states[:, :-2]) + loop.d_reference
+    before = states[:, own] if box.lag else 0.0
+    return states[:, :own], (1.0 - box.lag) * command + box.lag * before
 
 
 def _respond(

@@ -14,7 +14,7 @@ from piezo_control.parameters import ParameterError, group, parameter
 
 REACH = Feedforward(FeedforwardParameters(), sample_time=1e-4).reachable_range
 """Of the default finger (m)."""
-METHODS = ("hinf", "given", "pid", "integrator_notch")
+METHODS = ("hinf", "given", "damped_integrator", "pid", "integrator_notch")
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,16 @@ class Uncertainty:
     damping_high: float = parameter(2.0, "largest factor on the damping ratio", low=1.0, high=100.0)
     gain_low: float = parameter(0.9, "smallest factor on the loop gain", low=0.01, high=1.0)
     gain_high: float = parameter(1.1, "largest factor on the loop gain", low=1.0, high=100.0)
+    unmodelled_share: float = parameter(
+        0.0,
+        "static share, of either sign, of a mode that nobody modelled; the loop has to stay stable",
+        low=0.0,
+        high=0.9,
+    )
+    unmodelled_from_hz: float = parameter(
+        2000.0, "such a mode lies anywhere from here on", unit="Hz", low=1.0, high=1e6
+    )
+    unmodelled_damping: float = parameter(0.017, "its smallest damping ratio", low=1e-3, high=0.5)
 
     def __post_init__(self) -> None:
         if self.resonance_stable < self.resonance:
@@ -88,6 +98,9 @@ class Specification:
     static_error: float = parameter(0.0005, "of the step", low=0.0, high=1.0)
     sensitivity_peak: float = parameter(1.6, "largest |S|", low=1.01, high=100.0)
     effort_peak: float = parameter(4.0, "largest |K S|: command per reading", low=0.1, high=1e4)
+    noise_gain: float = parameter(
+        0.0, "scatter of the command per scatter of the readings; 0: any", low=0.0, high=100.0
+    )
     drift_per_degc: float = parameter(
         5e-8, "deflection per degree of a temperature step, at any moment", unit="m/degC", low=0.0
     )
@@ -156,7 +169,7 @@ class DesignProblem:
     method: str = parameter(
         "hinf",
         "'hinf': from the weights; 'given': `controller`, discretised; "
-        "'pid', 'integrator_notch': that structure, tuned to the specifications",
+        "'damped_integrator', 'pid', 'integrator_notch': that structure, tuned to the specifications",
         choices=METHODS,
     )
     finger: FingerModel = group(FingerModel)
@@ -172,6 +185,12 @@ class DesignProblem:
     integrator: bool = parameter(True, "make the controller's slowest pole an exact integrator")
     order: int = parameter(0, "order to reduce to, without the prefilter; 0: not reduced", low=0)
     prefilter: Prefilter = group(Prefilter)
+    feedforward: float = parameter(
+        0.0,
+        "part of the filtered reference that goes straight to the command",
+        low=-10.0,
+        high=10.0,
+    )
     controller: TransferFunction = group(TransferFunction)
 
     def __post_init__(self) -> None:

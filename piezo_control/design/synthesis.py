@@ -53,6 +53,19 @@ TUNING_EVALUATIONS = 250
 TUNING_RESERVE = 0.95
 """Part of each specification that tuning uses: the certificate looks at more fingers than it does."""
 
+IS_FREQUENCY = np.array([True, False, False, True, False, True, False, False, True, False])
+DAMPED_STARTS = np.array(
+    [
+        (0.1298, 0.5102, 0.4643, 0.3698, 1.3723, 1.1682, 0.2553, 1.2835, 0.1979, 1.1027),
+        (0.1407, 0.6101, 0.4455, 0.3939, 1.6508, 1.2262, 0.2588, 1.1817, 0.2128, 1.1241),
+        (0.1535, 0.7372, 0.4213, 0.3284, 1.7570, 1.2410, 0.2949, 1.1985, 0.1932, 1.1001),
+    ]
+)
+"""Arguments of `_damped_candidate` for one, two and three samples of delay, frequencies per resonance.
+
+By differential evolution and simplex searches over the corners of params/synthesis_robust.yaml's box.
+"""
+
 
 class SynthesisError(ValueError):
     """A design problem without a solution; the message says why."""
@@ -330,7 +343,7 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
     """Return the feedback law of a discrete controller from error to command.
 
     `system` has its slowest pole as the first state. Adds the prefilter F, so that the controller
-    sees F r - y, and an anti-windup gain: the stationary Kalman gain of an observer of the controller,
+    sees F r - y, the part of F r that goes straight to the command, and an anti-windup gain: the stationary Kalman gain of an observer of the controller,
     for noise on its error and, with a variance of ANTI_WINDUP_NOISE of that, on its command. The
     result does not count as certified: only :mod:`certificate` can say that.
     """
@@ -362,10 +375,10 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
         command_high=problem.finger.command_high,
         a=values(whole),
         b=values(b, without),
-        c=values(c, d * filtered.c),
+        c=values(c, (d + problem.feedforward) * filtered.c),
         d=float(d),
         reference_b=values(b * direct, filtered.b) if size else (),
-        reference_d=float(d * direct),
+        reference_d=float(d * direct + problem.feedforward * filtered.d[0, 0]),
         anti_windup=values(anti_windup, without),
     )
 
@@ -389,6 +402,7 @@ def tune(problem: DesignProblem) -> DesignProblem:
     """
     complete, start = {
         "hinf": (_hinf_candidate, _hinf_start),
+        "damped_integrator": (_damped_candidate, _damped_start),
         "pid": (_pid_candidate, _pid_start),
         "integrator_notch": (_notch_candidate, _notch_start),
     }[problem.method]
@@ -458,6 +472,29 @@ def shaped_weights(
             (1.0 / roll_off**2, 2.0 / roll_off, 1.0),
         ),
         disturbance=TransferFunction((disturbance,), (1.0,)),
+    )
+
+
+def _damped_start(problem: DesignProblem) -> list[float]:
+    """Return the best of a long search for the default finger, scaled to this one's resonance."""
+    omega = _resonance(problem)
+    delay = min(max(problem.finger.delay_samples, 1), len(DAMPED_STARTS))
+    return (DAMPED_STARTS[delay - 1] * np.where(IS_FREQUENCY, omega, 1.0)).tolist()
+
+
+def _damped_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
+    """Return an integrator less a resonant term that damps, with roll-off, and most of F r fed forward."""
+    rate, position, speed, frequency, damping, roll_off, roll_damping = (float(v) for v in x[:7])
+    feedforward, filter_frequency, filter_damping = (float(v) for v in x[7:])
+    resonant = (1.0 / frequency**2, 2.0 * damping / frequency, 1.0)
+    numerator = np.polysub(np.multiply(rate, resonant), (speed / frequency, position, 0.0))
+    denominator = np.polymul(
+        (*resonant, 0.0), (1.0 / roll_off**2, 2.0 * roll_damping / roll_off, 1.0)
+    )
+    return dataclasses.replace(
+        _given(problem, numerator.tolist(), denominator.tolist()),
+        prefilter=Prefilter(filter_frequency, min(max(filter_damping, 0.1), 10.0)),
+        feedforward=feedforward,
     )
 
 
