@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the files that come with the package are: parameters, message definitions, layouts."""
+"""Where the files that come with the package are: parameters, message definitions, layouts; its version."""
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 PACKAGE = "piezo_gripper"
@@ -22,3 +23,8 @@ def shared_folder() -> Path:
         if (place / "params").is_dir():
             return place
     raise FileNotFoundError(f"no 'params' beside {here.parents[1]}: the installation is incomplete")
+
+
+def version() -> str:
+    """Return the version of the package, as package.xml has it."""
+    return str(ElementTree.parse(shared_folder() / "package.xml").findtext("version"))

@@ -12,7 +12,7 @@ as Python, slowly.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,13 +99,14 @@ class Inputs(NamedTuple):
 
 
 class Outputs(NamedTuple):
-    """What is taken down of every `every`-th sample."""
+    """What is taken down of every `every`-th sample; `clips` counts how often a limit acted until then."""
 
     deflection: np.ndarray
     command: np.ndarray
     voltage: np.ndarray
     total_force: np.ndarray
     true_deflection: np.ndarray
+    clips: np.ndarray
 
 
 class SensorlessFinger(NamedTuple):
@@ -174,7 +175,7 @@ def run(
         )
     finger = finger_at_rest(plant, feedforward, feedback, temperatures_of(temperatures, h, 1)[0])
     clipped = finger.feedforward_state.clipped
-    return _run(
+    made = _run(
         run_samples,
         finger,
         clipped,
@@ -186,6 +187,10 @@ def run(
         every,
         compiled,
     )
+    at_end = (made.command <= feedback.command_low) | (made.command >= feedback.command_high)
+    if feedback.controller == "none":
+        at_end &= made.command != made.reference
+    return replace(made, limited=np.maximum(made.limited, at_end))
 
 
 def run_sensorless(
@@ -309,6 +314,7 @@ def _run(
         deflection=outputs.deflection,
         command=outputs.command,
         voltage=outputs.voltage,
+        limited=(np.diff(outputs.clips, prepend=0.0) > 0.0).astype(float),
         temperature=degc[::every],
         tip_force=forces[::every],
         true_deflection=outputs.true_deflection,
@@ -454,6 +460,7 @@ def run_fingers(
                 others.voltage,
                 others.total_force,
                 others.true_deflection,
+                others.clips,
             ),
         )
 
@@ -476,6 +483,7 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
+            outputs.clips[row] = finger.feedforward_state.clipped[0]
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 
 
@@ -498,6 +506,7 @@ def run_sensorless_samples(
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
+            outputs.clips[row] = finger.law_state.clipped[0]
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 
 
@@ -528,4 +537,5 @@ def run_touching_samples(
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
+            outputs.clips[row] = finger.law_state.models.clipped[0]
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])

@@ -2,6 +2,7 @@
 """The paper's table: every number again, by formulas of this file's own, from the bags of shorter runs."""
 
 import dataclasses
+import io
 import json
 import math
 import sys
@@ -9,11 +10,13 @@ import sys
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
 from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
+from piezo_control.shared import version
 from piezo_sim.experiment import cli, paper, results
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
 from piezo_sim.experiment.cases import (
@@ -24,6 +27,7 @@ from piezo_sim.experiment.cases import (
     read_experiment,
 )
 from piezo_sim.experiment.on_engine import run_on_engine
+from piezo_sim.experiment.report import print_table
 
 LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
 H = 1e-4
@@ -294,14 +298,22 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     assert run_cli(monkeypatch, "step", "--out", out, "--overwrite", *options) == 0
     content = json.loads((out / "metrics.json").read_text())
     assert [c["mode"] for c in content["cases"]] == [
-        m for m in ("open_loop", "feedforward", "feedback") for _ in (25, 32)
-    ]
+        m for m in ("open_loop", "feedforward", "feedback", "feedback") for _ in (25, 32)
+    ] + ["feedback"]  # the warm-up of the second controller
     assert {c["temperature_degc"] for c in content["cases"]} == {25.0, 32.0}
-    assert [c["reference_um"] for c in content["cases"]] == pytest.approx([10.0] * 6)
+    assert [c["reference_um"] for c in content["cases"]] == pytest.approx([10.0] * 9)
     assert {c["plant"] for c in content["cases"]} == {"truth"}
     assert content["thermal_step"]["temperature_change_degc"] == pytest.approx(7.0)
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 3 and "http" not in page
+    assert "misses the paper&#39;s specification: response time" in page  # 13.3 ms in theory
+    assert (
+        "&#39;robust&#39; misses the paper&#39;s specification: overshoot" in page
+    )  # truth plant, half a step
+    assert f"experiment step --out {out}" in page and version() in page
+    assert 'href="bags/step_feedback_paper_25degc/"' in page and 'href="metrics.json"' in page
+    assert QUANTITIES["static_error_percent"].definition in page
+    assert "cantilever: plant" in page and "truth" in page
 
     assert mine.read_text() == "a day's work"
     assert (
@@ -311,14 +323,14 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     assert json.loads((out / "metrics.json").read_text()) == content  # a failure replaces nothing
     capsys.readouterr()
 
-    first, second = (out / "bags" / f"step_feedback_{t}degc" for t in (25, 32))
+    first, second = (out / "bags" / f"step_feedback_paper_{t}degc" for t in (25, 32))
     assert run_cli(monkeypatch, "analyse", first, "--out", tmp_path / "a") == 0
     case = content["cases"][4]
     assert f"{case['settling_time_5pct_ms']:.1f}" in capsys.readouterr().out
     assert run_cli(monkeypatch, "compare", first, second, "--out", tmp_path / "c") == 0
     change = content["cases"][5]["rise_time_ms"] - case["rise_time_ms"]
     assert f"{change:.2f}" in capsys.readouterr().out
-    other = out / "bags" / "thermal_step_feedback"
+    other = out / "bags" / "thermal_step_feedback_paper"
     assert run_cli(monkeypatch, "compare", first, other, "--out", tmp_path / "c") == 1
     assert "different kinds" in capsys.readouterr().err
     assert run_cli(monkeypatch, "analyse", out, "--out", tmp_path / "a") == 1
@@ -327,6 +339,31 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     assert first.exists() and other.exists()
     assert run_cli(monkeypatch, "analyse", first, "--out", mine) == 2
     assert "is a file" in capsys.readouterr().err
+
+
+def test_tables_are_whole_at_80_columns(short):
+    for section in results.sections(short[1], short[0]) + [paper.section(short[1])]:
+        console = Console(width=80, file=io.StringIO())
+        print_table(console, section)
+        lines = console.file.getvalue().splitlines()
+        assert max(map(len, lines)) <= 80
+        words = " ".join(lines).split()
+        for row in section.rows:
+            assert not set(" ".join(row).split()) - set(words)
+
+
+@pytest.mark.parametrize("amplitude_v", [40.0, 60.0])
+def test_saturation_is_seen_in_the_bag(tmp_path, amplitude_v):
+    """The share of the time for which the sine that is asked for is above the 40 V of the amplifier."""
+    _, (case, *_) = read_experiment("hysteresis", {"amplitude_v": amplitude_v})
+    made = run_on_engine(
+        dataclasses.replace(case, engine=True), tmp_path, "finger", Progress(disable=True)
+    )
+    figures = analyse(read(made.bag), "hysteresis")
+    asked = amplitude_v * np.sin(2.0 * np.pi * 2e-4 * np.arange(case.samples))
+    assert figures["limited_percent"] == pytest.approx(
+        100 * np.mean(asked > 40.0) + 100 * np.mean(asked < -40.0), abs=0.1
+    )
 
 
 def test_recover_makes_a_whole_bag_of_a_cut_one(monkeypatch, tmp_path, capsys):

@@ -28,6 +28,7 @@ def run_of(count: int = COUNT) -> Recording:
     return Recording(
         number=number,
         time=time,
+        limited=(signals["voltage"] > 1.0).astype(float),
         reference=REFERENCE.at(time),
         temperature=np.where(time < 0.7, 22.0, 32.0),
         tip_force=FORCE.at(time),
@@ -44,7 +45,7 @@ def written(tmp_path_factory):
 
 
 def assert_same(got: Recording, made: Recording, count: int) -> None:
-    for name in ("number", "time", "reference", "deflection", "command", "voltage", "temperature",
+    for name in ("number", "time", "reference", "deflection", "command", "voltage", "limited", "temperature",
                  "tip_force"):  # fmt: skip
         np.testing.assert_allclose(
             getattr(got, name), getattr(made, name)[:count], rtol=0, atol=1e-12, err_msg=name

@@ -276,8 +276,8 @@ def weighted_norms(problem: DesignProblem, controller: FeedbackParameters) -> di
 class Row:
     """One line of the table.
 
-    `required` (a largest value, except for the gamma to be confirmed), `nominal` and `worst` are in
-    `unit`; `at` says which finger is the worst.
+    `nominal` and `worst` are in `unit` and stand in `relation` to what is `required`; `at` says which
+    finger is the worst.
     """
 
     specification: str
@@ -287,6 +287,7 @@ class Row:
     worst: float
     at: str
     met: bool
+    relation: str = "≤"
 
 
 @dataclass(frozen=True)
@@ -404,7 +405,7 @@ def _stability_row(label: str, box: Fingers, radius: np.ndarray) -> Row:
     worst = int(np.argmax(radius))
     nominal = float(radius[len(radius) // 2])
     is_stable = bool(radius[worst] < 1.0)
-    return Row(label, "", 1.0, nominal, float(radius[worst]), _describe(box, worst), is_stable)
+    return Row(label, "", 1.0, nominal, float(radius[worst]), _describe(box, worst), is_stable, "<")
 
 
 def _proven_rows(
@@ -446,7 +447,7 @@ def _gamma_row(problem: DesignProblem, gamma: float, norm: float) -> Row:
     low = gamma / (GAMMA_AGREEMENT * problem.gamma_margin)
     is_confirmed = low <= norm <= GAMMA_AGREEMENT * gamma
     return Row(
-        "weighted norm is the solver's gamma", "", gamma, norm, norm, "nominal", is_confirmed
+        "weighted norm is the solver's gamma", "", gamma, norm, norm, "nominal", is_confirmed, "≈"
     )
 
 

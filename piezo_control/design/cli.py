@@ -26,6 +26,7 @@ from typing import Any
 # Many small matrices: the threads of BLAS, started with numpy, would make the search ten times slower.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from rich import box  # noqa: E402
 from rich.console import Console  # noqa: E402
 from rich.table import Table  # noqa: E402
 
@@ -166,21 +167,24 @@ def _finite(value: Any) -> Any:
 
 
 HEADINGS = ("specification", "required", "nominal", "worst case", "met", "worst at")
+NUMERIC = HEADINGS[1:4]
 
 
 def cells(row: Row) -> tuple[str, ...]:
     """Return a line of the certificate as text, one entry per heading."""
     label = f"{row.specification}, {row.unit}" if row.unit else row.specification
-    values = (f"{value:.4g}" for value in (row.required, row.nominal, row.worst))
-    return (label, *values, "yes" if row.met else "NO", row.at)
+    required = f"{row.relation} {row.required:.4g}"
+    return (
+        label, required, f"{row.nominal:.4g}", f"{row.worst:.4g}", "yes" if row.met else "NO", row.at
+    )  # fmt: skip
 
 
 def show(console: Console, certificate: Certificate) -> None:
     """Print the certificate as a table, and the figures that nothing is required of."""
     verdict = "certified" if certificate.met else "NOT certified"
-    table = Table(title=f"{certificate.name}: {verdict}")
+    table = Table(title=f"{certificate.name}: {verdict}", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in HEADINGS[:-1]:
-        table.add_column(heading)
+        table.add_column(heading, justify="right" if heading in NUMERIC else "left")
     for row in certificate.rows:
         table.add_row(*cells(row)[:-1], style="" if row.met else "red")
     console.print(table)
@@ -215,7 +219,11 @@ def comment(certificate: Certificate, source: Path) -> str:
     lines = [HEADINGS, *(cells(row) for row in certificate.rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(HEADINGS))]
     table = (
-        "  ".join(cell.ljust(width) for cell, width in zip(line, widths)).rstrip() for line in lines
+        "  ".join(
+            cell.rjust(width) if heading in NUMERIC else cell.ljust(width)
+            for heading, cell, width in zip(HEADINGS, line, widths)
+        ).rstrip()
+        for line in lines
     )
     return "\n".join(
         [

@@ -218,10 +218,13 @@ class FeedbackNode(BlockNode):
         self.deflection = sample.value
         if self.parameters.mode == "free_running" and not self._is_in_time():
             return False
-        reference = self.reference[sample.number]
+        p, reference = self.parameters, self.reference[sample.number]
         answer.by_controller = self._has_a_rate()
-        if not self.parameters.force_control:
+        if not p.force_control:
             answer.value = self.law.step(reference, sample.value)
+            # A reference that passes through and is the end of the range is not limited.
+            at_end = not p.command_low < answer.value < p.command_high
+            answer.limited = at_end and (answer.by_controller or answer.value != reference)
             return True
         if not self._is_expected():
             return False

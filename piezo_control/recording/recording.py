@@ -31,7 +31,7 @@ class Recording:
     `time` counts in seconds from the first sample and `number` are the samples' numbers; deflection,
     reference and command are in m, voltage in V, tip_force (external) in N, temperature in °C. Deflection
     k is what the sensor said at time[k]; command and voltage k are the answer to it, in force from then
-    on until the next.
+    on until the next. `limited` is 1 where a limit acted on command or voltage k, else 0.
     """
 
     number: NDArray[np.int64]
@@ -40,6 +40,7 @@ class Recording:
     deflection: NDArray[np.float64]
     command: NDArray[np.float64]
     voltage: NDArray[np.float64]
+    limited: NDArray[np.float64]
     temperature: NDArray[np.float64]
     tip_force: NDArray[np.float64]
 
@@ -141,6 +142,7 @@ def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
     names = ("reference", "deflection", "command", "voltage")
     signals = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
     signals["stamps"] = np.concatenate(stamps)
+    signals["limited"] = np.full(signals["voltage"].shape, np.nan)  # blocks do not say
     signals["received"] = signals["stamps"]
     number, first = np.unique(number.astype(np.int64), return_index=True)
     return {"number": number, **{name: signal[first] for name, signal in signals.items()}}
@@ -154,15 +156,17 @@ def _from_samples(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
     deflection, received = messages[chosen], np.array(bag.topics[topic].stamps[chosen])
     number, first = np.unique([m.number for m in deflection], return_index=True)
     stamps = np.array([_nanoseconds(deflection[i].header.stamp) for i in first])
+    commands, voltages = (bag.messages(prefix + n, SAMPLE_TYPE) for n in ("command", "voltage"))
     return {
         "number": number,
         "stamps": stamps,
         "received": received[first],
         "deflection": np.array([deflection[i].value for i in first]),
-        **{
-            name: _align(number, bag.messages(prefix + name, SAMPLE_TYPE), stamps)
-            for name in ("command", "voltage")
-        },
+        "command": _align(number, commands, stamps, "value"),
+        "voltage": _align(number, voltages, stamps, "value"),
+        "limited": np.maximum(
+            *(_align(number, answers, stamps, "limited") for answers in (commands, voltages))
+        ),
     }
 
 
@@ -189,14 +193,14 @@ def _nanoseconds(stamp: Any) -> int:
     return stamp.sec * 10**9 + stamp.nanosec
 
 
-def _align(number: NDArray, samples: list[Any], stamps: NDArray) -> NDArray[np.float64]:
-    """Return the values of the sample `number`s, looked for between the first and the last stamp."""
+def _align(number: NDArray, samples: list[Any], stamps: NDArray, field: str) -> NDArray[np.float64]:
+    """Return a field of the sample `number`s, looked for between the first and the last stamp."""
     values = {
-        m.number: m.value
+        m.number: getattr(m, field)
         for m in samples
         if stamps[0] <= _nanoseconds(m.header.stamp) <= stamps[-1]
     }
-    return np.array([values.get(n, np.nan) for n in number.tolist()])
+    return np.array([values.get(n, np.nan) for n in number.tolist()], float)
 
 
 def _signal(bag: Bag, name: str, received: NDArray, elapsed: NDArray) -> NDArray[np.float64]:

@@ -124,16 +124,21 @@ def write_recording(
         bag.write(topic, 0, _profile(bag, profile))
     period = float(recording.time[1] - recording.time[0]) if recording.time.size > 1 else 0.0
     stamps = np.rint(recording.time * 1e9).astype(int).tolist()
+    unlimited = [False] * len(stamps)
     signals = [
-        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE), getattr(recording, name).tolist())
-        for name in ("deflection", "command", "voltage")
+        (bag.add(f"/{finger}/{name}", SAMPLE_TYPE), getattr(recording, name).tolist(), limited)
+        for name, limited in (
+            ("deflection", unlimited),
+            ("command", unlimited),
+            ("voltage", (recording.limited == 1.0).tolist()),
+        )
     ]
     warmth = bag.add(f"/{finger}/temperature", TEMPERATURE_TYPE)
     changes = set(np.flatnonzero(np.diff(recording.temperature, prepend=np.nan)).tolist())
     for k, (number, stamp) in enumerate(zip(recording.number.tolist(), stamps)):
         if k in changes:
             bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
-        for topic, values in signals:
+        for topic, values, limited in signals:
             data = SAMPLE_CDR.pack(
                 LITTLE_ENDIAN,
                 *divmod(stamp, 10**9),
@@ -141,7 +146,7 @@ def write_recording(
                 number,
                 values[k],
                 period,
-                False,
+                limited[k],
                 False,
                 False,
             )

@@ -2,7 +2,7 @@
 """From a recording to its figures of merit; everything here is computed from bags alone.
 
 There is one analysis per kind of experiment, a function of a recording that returns ``{quantity: value}``.
-`QUANTITIES` says how each is shown; a value that does not exist, a settling that never comes, is None.
+`QUANTITIES` says how each is shown and what it is; a value that does not exist, a settling that never comes, is None.
 The definitions are those of :mod:`piezo_control.metrics`.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,38 +19,48 @@ from piezo_control.recording.recording import BagError, Recording
 
 Figures = dict[str, float | int | None]
 
+
+class Quantity(NamedTuple):
+    """How a figure is shown: heading with unit, decimals; and what it is, in a sentence for reports."""
+
+    heading: str
+    digits: int
+    definition: str
+
+
 QUANTITIES = {
-    "reference_um": ("reference [µm]", 1),
-    "final_um": ("final deflection [µm]", 2),
-    "ringing_hz": ("ringing [Hz]", 1),
-    "damping_ratio": ("damping ratio", 4),
-    "rise_time_ms": ("rise 10–90 % [ms]", 2),
-    "settling_time_5pct_ms": ("settling to 5 % [ms]", 1),
-    "settling_time_2pct_ms": ("settling to 2 % [ms]", 1),
-    "overshoot_percent": ("overshoot [%]", 2),
-    "static_error_percent": ("static error [%]", 3),
-    "creep_um": ("creep [µm]", 2),
-    "creep_percent": ("creep [%]", 1),
-    "peak_to_peak_um": ("peak to peak [µm]", 2),
-    "loop_width_um": ("loop width [µm]", 2),
-    "loop_width_percent": ("loop width [%]", 2),
-    "slope": ("slope", 4),
-    "peak_error_percent": ("peak error [% of stroke]", 2),
-    "slope_um_per_v": ("slope [µm/V]", 4),
-    "bandwidth_rad_s": ("−3 dB [rad/s]", 0),
-    "lowest_rad_s": ("from [rad/s]", 2),
-    "highest_rad_s": ("to [rad/s]", 0),
-    "peak_db": ("peak [dB]", 2),
-    "temperature_change_degc": ("change of temperature [°C]", 1),
-    "deflection_change_um": ("largest change of deflection [µm]", 3),
-    "rejection_um_per_degc": ("change per degree [µm/°C]", 4),
-    "force_change_mn": ("force [mN]", 2),
-    "change_per_force_um_per_mn": ("change per force [µm/mN]", 3),
-    "recovery_ms": ("recovery to 5 % [ms]", 1),
-    "remaining_um": ("remaining change [µm]", 3),
-    "samples": ("samples", 0),
-}
-"""Quantity to heading and decimals, in the order of the columns."""
+    "reference_um": Quantity("reference [µm]", 1, "last value of the reference"),
+    "final_um": Quantity("final deflection [µm]", 2, "mean of the last tenth of the record (creep: of its last 0.5 s)"),
+    "ringing_hz": Quantity("ringing [Hz]", 1, "frequency of the vibration around the final deflection"),
+    "damping_ratio": Quantity("damping ratio", 4, "of that vibration, from its decay"),
+    "rise_time_ms": Quantity("rise 10–90 % [ms]", 2, "time from 10 to 90 % of the way to the final deflection"),
+    "settling_time_5pct_ms": Quantity("settling to 5 % [ms]", 1, "time from the step after which the deflection stays within 5 % of its way around the final value"),
+    "settling_time_2pct_ms": Quantity("settling to 2 % [ms]", 1, "the same for 2 %"),
+    "overshoot_percent": Quantity("overshoot [%]", 2, "how far the deflection goes beyond the reference, in % of the step"),
+    "static_error_percent": Quantity("static error [%]", 3, "distance of the mean of the last tenth of the record from the reference, in % of the step"),
+    "creep_um": Quantity("creep [µm]", 2, "way from 1 s after the step of the voltage to the end, both averaged over 0.5 s"),
+    "creep_percent": Quantity("creep [%]", 1, "creep in % of the deflection 1 s after the step"),
+    "peak_to_peak_um": Quantity("peak to peak [µm]", 2, "highest less lowest deflection, of the last cycle where there are cycles"),
+    "loop_width_um": Quantity("loop width [µm]", 2, "largest distance, at one drive, of the falling from the rising branch of the last cycle"),
+    "loop_width_percent": Quantity("loop width [%]", 2, "loop width in % of peak to peak"),
+    "slope": Quantity("slope", 4, "of the straight line through the last cycle of deflection over reference, by least squares"),
+    "peak_error_percent": Quantity("peak error [% of stroke]", 2, "largest distance of the deflection from the reference in the last cycle, in % of the reference's stroke"),
+    "slope_um_per_v": Quantity("slope [µm/V]", 4, "of the straight line through the last cycle of deflection over voltage, by least squares"),
+    "bandwidth_rad_s": Quantity("−3 dB [rad/s]", 0, "where the magnitude has fallen 3 dB below that at the lowest frequency"),
+    "lowest_rad_s": Quantity("from [rad/s]", 2, "lowest frequency of the multisine"),
+    "highest_rad_s": Quantity("to [rad/s]", 0, "highest frequency of the multisine"),
+    "peak_db": Quantity("peak [dB]", 2, "largest magnitude, above that at the lowest frequency"),
+    "temperature_change_degc": Quantity("change of temperature [°C]", 1, "largest change from the temperature at the beginning"),
+    "deflection_change_um": Quantity("largest change of deflection [µm]", 3, "from the deflection held before the disturbance; for a temperature averaged over 10 ms"),
+    "rejection_um_per_degc": Quantity("change per degree [µm/°C]", 4, "largest change of deflection over the change of temperature"),
+    "force_change_mn": Quantity("force [mN]", 2, "change of the force on the tip"),
+    "change_per_force_um_per_mn": Quantity("change per force [µm/mN]", 3, "largest change of deflection over the change of force"),
+    "recovery_ms": Quantity("recovery to 5 % [ms]", 1, "time from the disturbance until 5 % of the largest change is left, around what remains"),
+    "remaining_um": Quantity("remaining change [µm]", 3, "of the deflection, at the end of the record"),
+    "limited_percent": Quantity("at a limit [% of samples]", 1, "saturation: share of the samples at which the command came to the end of its range, or the voltage or its slew to their limits"),
+    "samples": Quantity("samples", 0, "length of the record"),
+}  # fmt: skip
+"""Quantities in the order of the columns."""
 
 AVERAGE = 0.01  # s of the moving average over a deflection that follows a temperature
 CREEP_BEGIN = 1.0  # s after the step from which on slow motion counts as creep
@@ -208,7 +219,10 @@ def analyse(recording: Recording, kind: str) -> Figures:
     Raises BagError when the signals are not those of such an experiment.
     """
     try:
-        return {**ANALYSES[kind](recording), "samples": int(recording.time.size)}
+        figures = ANALYSES[kind](recording)
+        if np.all(np.isfinite(recording.limited)):
+            figures["limited_percent"] = float(np.mean(recording.limited)) * 100
+        return {**figures, "samples": int(recording.time.size)}
     except ValueError as error:
         raise BagError(f"cannot be analysed as '{kind}': {error}") from None
 

@@ -10,7 +10,7 @@ from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import Figures, analyse, classify
 from piezo_sim.experiment.report import Section
-from piezo_sim.experiment.results import CAPTIONS, HEADINGS, table
+from piezo_sim.experiment.results import CAPTIONS, HEADINGS, definitions, table
 
 
 def recordings(
@@ -32,9 +32,10 @@ def analyse_bags(found: Mapping[str, Recording], kind: str | None, out: Path) ->
 
     Raises BagError naming the bag when its signals are not those of such an experiment.
     """
-    made = []
+    made, shown = [], []
     for number, (name, recording) in enumerate(found.items()):
         chosen, figures = _figures(name, recording, kind)
+        shown.append(figures)
         png = plots.PLOTS[chosen](
             {name: {"deflection": [recording]}}, out / f"{number}_{chosen}.png"
         )
@@ -46,11 +47,11 @@ def analyse_bags(found: Mapping[str, Recording], kind: str | None, out: Path) ->
                 *table({name: figures}, "bag"),
             )
         )
-    return made
+    return [*made, definitions(shown)]
 
 
-def compare_bags(found: Mapping[str, Recording], kind: str | None, out: Path) -> Section:
-    """Return a section with all recordings in one plot and one table, the first being the reference.
+def compare_bags(found: Mapping[str, Recording], kind: str | None, out: Path) -> list[Section]:
+    """Return sections with all recordings in one plot and one table, the first being the reference.
 
     Below each other bag the table says how far its figures are from those of the first. Raises BagError
     when the recordings are of different kinds.
@@ -71,7 +72,8 @@ def compare_bags(found: Mapping[str, Recording], kind: str | None, out: Path) ->
         rows[name] = row
         if name != first:
             rows[f"  {name} − {first}"] = _difference(row, figures[first])
-    return Section("Comparison", "", [(png, CAPTIONS[chosen])], *table(rows, "bag"))
+    section = Section("Comparison", "", [(png, CAPTIONS[chosen])], *table(rows, "bag"))
+    return [section, definitions(figures.values())]
 
 
 def _difference(row: Figures, first: Figures) -> Figures:

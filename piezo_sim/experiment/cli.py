@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from piezo_control.parameters import ParameterError
@@ -94,9 +95,14 @@ def run_into(
 
         content["sensorless"], tables = sensorless.study()
         sections += tables
+    sections += [results.definitions(r.figures for r in found), results.parameters(cases)]
+    verdict = paper.verdict(found)
     results.write_metrics(content, out)
-    write_html(out / "report.html", title, sections, results.footer(content, len(found)))
+    footer = results.footer(content, len(found))
+    write_html(out / "report.html", title, sections, verdict, footer)
     print_tables(console, sections)
+    for sentence in verdict:
+        console.print(escape(sentence), highlight=False)
 
 
 def run_all(
@@ -133,9 +139,9 @@ def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> N
     if len(found) < 2:
         raise ParameterError(f"compare needs two bags or more, not {len(found)}")
     with results_folder(out, overwrite=True) as folder:
-        section = compare_bags(found, arguments.kind, folder)
-        write_html(folder / "report.html", "Comparison of recorded bags", [section])
-    print_tables(console, [section])
+        sections = compare_bags(found, arguments.kind, folder)
+        write_html(folder / "report.html", "Comparison of recorded bags", sections)
+    print_tables(console, sections)
 
 
 def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> None:
@@ -154,9 +160,10 @@ def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def print_tables(console: Console, sections: Sequence[Section]) -> None:
-    """Print the table of each section."""
+    """Print the table of each section of the results themselves."""
     for section in sections:
-        print_table(console, section)
+        if not section.is_appendix:
+            print_table(console, section)
 
 
 def parser() -> argparse.ArgumentParser:

@@ -21,6 +21,7 @@ from piezo_sim.experiment.report import Section
 from piezo_sim.experiment.results import Result
 
 Values = list[float]
+SPECIFICATION = "Specification: "
 
 
 @dataclass(frozen=True)
@@ -154,29 +155,50 @@ CLAIMS = (
 def compare(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Return the lines of the table: texts, values per column ('open loop' or controller), verdicts."""
     controllers = _controllers(results)
-    lines = []
-    for claim in CLAIMS:
-        columns = controllers if claim.is_closed_loop else ["none"]
-        values = {
-            c: claim.value([r for r in results if r.run.case.controller == c]) for c in columns
-        }
-        has_limit = math.isfinite(claim.low) or math.isfinite(claim.high)
-        met = {
-            c: all(claim.low <= v <= claim.high for v in found) if has_limit and found else None
-            for c, found in values.items()
-        }
-        lines.append(
-            {
-                "quantity": claim.quantity,
-                "asked": claim.asked,
-                "paper": claim.paper,
-                "paper_met": claim.paper_met,
-                "values": values,
-                "met": met,
-                "digits": claim.digits,
-            }
-        )
-    return lines
+    return [
+        _line(claim, results, controllers if claim.is_closed_loop else ["none"]) for claim in CLAIMS
+    ]
+
+
+def _line(claim: Claim, results: Sequence[Result], columns: Sequence[str]) -> dict[str, Any]:
+    values = {c: claim.value([r for r in results if r.run.case.controller == c]) for c in columns}
+    has_limit = math.isfinite(claim.low) or math.isfinite(claim.high)
+    met = {
+        c: all(claim.low <= v <= claim.high for v in found) if has_limit and found else None
+        for c, found in values.items()
+    }
+    return {
+        "quantity": claim.quantity,
+        "asked": claim.asked,
+        "paper": claim.paper,
+        "paper_met": claim.paper_met,
+        "values": values,
+        "met": met,
+        "digits": claim.digits,
+    }
+
+
+def verdict(results: Sequence[Result]) -> list[str]:
+    """Return a sentence for each controller: what of the paper's specification it meets and misses."""
+    controllers = _controllers(results)
+    claims = [claim for claim in CLAIMS if claim.quantity.startswith(SPECIFICATION)]
+    lines = [_line(claim, results, controllers) for claim in claims]
+    sentences = []
+    for c in controllers:
+        said: dict[bool, list[str]] = {True: [], False: []}
+        for line in lines:
+            if line["met"][c] is not None:
+                quantity, unit = (
+                    line["quantity"].removeprefix(SPECIFICATION).rstrip("]").split(" [")
+                )
+                figure = f"{quantity} is {_cell(line['values'][c], line['digits'])} {unit}"
+                said[line["met"][c]].append(f"{figure}, asked {line['asked']}")
+        name = f"The {_name(c)}" if c == "paper" else f"'{c}'"
+        if said[False]:
+            sentences.append(f"{name} misses the paper's specification: {'; '.join(said[False])}.")
+        elif said[True]:
+            sentences.append(f"{name} meets the paper's specification: {'; '.join(said[True])}.")
+    return sentences
 
 
 def section(results: Sequence[Result]) -> Section:

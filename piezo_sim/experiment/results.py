@@ -4,17 +4,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from piezo_control.parameters import flatten
 from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import QUANTITIES, Figures, analyse
-from piezo_sim.experiment.cases import CaseRun
+from piezo_sim.experiment.cases import NODES, Case, CaseRun
 from piezo_sim.experiment.report import Section, cell
 
 MODE_TITLES = {
@@ -45,6 +46,7 @@ CAPTIONS = {
     "force": "Tip force, deflection from the value held before, and voltage.",
 }
 DRIVEN_BY_VOLTAGE = ("transient", "creep", "hysteresis", "excite")
+LONGEST_ARRAY = 4  # that a report shows element by element
 CLOSED_LOOP_AXIS = 0.045  # s: time axis of Fig. 13
 
 
@@ -96,9 +98,43 @@ def sections(results: Sequence[Result], out: Path) -> list[Section]:
                 group, kind, out / f"{experiment}_{kind}" if kind != experiment else out / kind
             ),
             *table({r.run.case.name: r.figures for r in group}, "case"),
+            links={r.run.case.name: f"{r.run.bag.relative_to(out)}/" for r in group},
         )
         for (experiment, kind), group in groups.items()
     ]
+
+
+def definitions(figures: Iterable[Figures]) -> Section:
+    """Return a section that says what each quantity is that the `figures` have."""
+    shown = set().union(*figures)
+    rows = [[q.heading, q.definition] for name, q in QUANTITIES.items() if name in shown]
+    return Section("Definitions", columns=["figure", "what it is"], rows=rows, is_appendix=True)
+
+
+def parameters(cases: Sequence[Case]) -> Section:
+    """Return a section with the parameters of the cases' nodes that are not the defaults."""
+    users: dict[tuple[str, str, str], list[str]] = {}
+    for case in cases:
+        for node, given in case.parameters().items():
+            default = flatten(NODES[node]())
+            for name, value in flatten(given).items():
+                if value != default[name]:
+                    users.setdefault((node, name, _shown(value)), []).append(case.name)
+    rows = [
+        [f"{node}: {name}", value, "all" if len(used) == len(cases) else ", ".join(used)]
+        for (node, name, value), used in sorted(users.items())
+    ]
+    return Section(
+        "Parameters that are not the defaults",
+        columns=["parameter", "value", "cases"],
+        rows=rows,
+        is_appendix=True,
+    )
+
+
+def _shown(value: Any) -> str:
+    is_long = isinstance(value, tuple) and len(value) > LONGEST_ARRAY
+    return f"{len(value)} values from {value[0]:g} to {value[-1]:g}" if is_long else str(value)
 
 
 def figures(results: Sequence[Result], kind: str, path: Path) -> list[tuple[Path, str]]:
@@ -119,9 +155,10 @@ def figures(results: Sequence[Result], kind: str, path: Path) -> list[tuple[Path
 def table(rows: Mapping[str, Figures], name: str) -> tuple[list[str], list[list[str]]]:
     """Return headings and cells of a table with a row per entry and a column per quantity."""
     shown = [q for q in QUANTITIES if any(q in row for row in rows.values())]
-    headings = [name, *(QUANTITIES[q][0] for q in shown)]
+    headings = [name, *(QUANTITIES[q].heading for q in shown)]
     cells = [
-        [title, *(cell(row.get(q), QUANTITIES[q][1]) for q in shown)] for title, row in rows.items()
+        [title, *(cell(row.get(q), QUANTITIES[q].digits) for q in shown)]
+        for title, row in rows.items()
     ]
     return headings, cells
 
@@ -140,7 +177,8 @@ def _origin(results: Sequence[Result]) -> str:
 def metrics(results: Sequence[Result], out: Path) -> dict[str, Any]:
     """Return the content of metrics.json: all cases, and how fast the nodes ran.
 
-    The warm-up at the end of the experiment `step` stands apart, as `thermal_step`.
+    The warm-up at the end of the experiment `step` stands apart, as `thermal_step`, that of further
+    controllers among the cases.
     """
     rows = [
         {
@@ -160,8 +198,8 @@ def metrics(results: Sequence[Result], out: Path) -> dict[str, Any]:
         r for r in rows if r["experiment"] == "step" and str(r["name"]).startswith("thermal_")
     ]
     content: dict[str, Any] = {"cases": rows}
-    if len(warm_ups) == 1:
-        content = {"cases": [r for r in rows if r not in warm_ups], "thermal_step": warm_ups[0]}
+    if warm_ups:
+        content = {"cases": [r for r in rows if r != warm_ups[0]], "thermal_step": warm_ups[0]}
     speeds = [r.run.steps_per_second for r in results if not r.run.case.engine]
     if speeds:
         content["loop"] = {
