@@ -13,7 +13,7 @@ help:
 	@echo "make servo      the step in real time, 10 kHz, against a finger in another process; results in out/servo"
 	@echo "make bench      speed of the loop; results in out/bench.json"
 	@echo "make lint       ruff and mypy"
-	@echo "make faults     a thousand random schedules of faults on live nodes; prints the seeds that fail"
+	@echo "make faults     a thousand random schedules of faults on live nodes; stopped, it goes on; prints the seeds that fail"
 	@echo "make coverage   the tests once more, and the lines that none of them reaches"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
 	@echo "make clean      remove what was built; distclean: the environment and the results too"

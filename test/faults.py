@@ -23,7 +23,7 @@ os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 import fault_bench
 import fault_events
-from fault_bench import Bench, Network
+from fault_bench import NODES, Bench, Network
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from std_srvs.srv import Trigger
 
@@ -93,7 +93,8 @@ def let_go_wrong(bench: Bench, cores: int) -> None:
         if (
             bench.finger.phase == FingerState.FAULT
         ):  # of a machine that is too busy for its time limits
-            bench.call(Trigger, "cantilever/reset", Trigger.Request())
+            for name in NODES:  # the cantilever at last
+                bench.call(Trigger, f"{name}/reset", Trigger.Request())
         return bench.samples > moving and bench.finger.phase == FingerState.RUNNING
 
     if not bench.wait(START, is_running):

@@ -107,7 +107,8 @@ class RecorderNode(FingerNode):
         for topic, (name, qos) in types.items():
             package, _, kind = name.split("/")
             message = getattr(importlib.import_module(f"{package}.msg"), kind)
-            write = partial(self._write, topic)
+            latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            write = partial(self._keep if latched else self._write, topic)
             self.inputs.append(self.create_subscription(message, topic, write, qos, raw=True))
         return super().on_configure(state)
 
@@ -122,6 +123,7 @@ class RecorderNode(FingerNode):
         writer = BagWriter(bag)
         self.tracks = {}
         self.newest = 0
+        self.has_blocks = False
         self.unstamped: list[tuple[str, bytes]] = []
         for topic, (name, qos) in self.types.items():
             if name not in writer.typestore.types:
@@ -169,11 +171,12 @@ class RecorderNode(FingerNode):
         )
         return offers[0].topic_type, qos
 
+    def _keep(self, topic: str, data: bytes) -> None:
+        """Write what is latched; what a profile said before the run began belongs to the run."""
+        self.latched[topic] = data
+        self._write(topic, data)
+
     def _write(self, topic: str, data: bytes) -> None:
-        if self.types[topic][1].durability == DurabilityPolicy.TRANSIENT_LOCAL:
-            self.latched[topic] = (
-                data  # what a profile said before the run began belongs to the run
-            )
         if self.writer is None:
             return
         track = self.tracks[topic]
@@ -202,6 +205,7 @@ class RecorderNode(FingerNode):
             self._give_up(self.writer, error)
             return
         track.recorded += 1
+        self.has_blocks |= track.is_block
 
     def _tell_time(self, newest: int) -> None:
         """Take note of the time (ns) of the newest sample; what waited for one is written."""
@@ -225,8 +229,7 @@ class RecorderNode(FingerNode):
             for other in self.tracks.values():
                 other.sequence = Sequence(gaps=True)
                 other.last_stamp = -1
-        if not any(other.is_block and other.recorded for other in self.tracks.values()):
-            # Beside blocks, single samples are a selection.
+        if not self.has_blocks:  # beside blocks, single samples are a selection
             track.missing += number - max(track.sequence.next, 0)
         track.sequence.count(number)
         return True
