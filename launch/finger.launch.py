@@ -3,7 +3,7 @@
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import IfElseSubstitution, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -12,6 +12,10 @@ ARGUMENTS = {
     "controller": ("robust", "controller: a shipped name, or the path of a parameter file"),
     "mode": ("lockstep", "lockstep or free_running"),
     "sample_time": ("0.0001", "sample time in s; that of the controller's design"),
+    "force_control": (
+        "false",
+        "feel and limit the force, in place of the controller (docs/touch.md)",
+    ),
     "state_period": ("0.1", "how often the finger's state is published, in s"),
 }
 
@@ -20,10 +24,12 @@ def generate_launch_description() -> LaunchDescription:
     controller = ParameterValue(LaunchConfiguration("controller"), value_type=str)
     common = {"mode": LaunchConfiguration("mode")}
     sampled = {**common, "sample_time": LaunchConfiguration("sample_time")}
+    feels = LaunchConfiguration("force_control")
+    compensator = IfElseSubstitution(feels, "sensorless", "inverse")
     nodes = {
         "temperature": [common],
-        "feedforward": [sampled],
-        "feedback": [{**common, "controller_file": controller}],
+        "feedforward": [{**sampled, "compensator": compensator}],
+        "feedback": [{**common, "controller_file": controller, "force_control": feels}],
         "cantilever": [
             {
                 **sampled,

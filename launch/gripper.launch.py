@@ -13,7 +13,8 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 FINGERS = ("left", "right")  # the default of the gripper node; lists do not pass launch whole
-STATE_PERIOD = "0.01"  # s, as often as the gripper publishes joint states
+# States as often as the gripper publishes joint states, and a force limit that the fingers keep by themselves.
+OF_A_GRIPPER = {"state_period": "0.01", "force_control": "true"}
 ARGUMENTS = {
     "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
     "joint_states": (
@@ -43,7 +44,7 @@ def generate_launch_description() -> LaunchDescription:
             *(
                 IncludeLaunchDescription(
                     finger,
-                    launch_arguments={"namespace": side, "state_period": STATE_PERIOD}.items(),
+                    launch_arguments={"namespace": side, **OF_A_GRIPPER}.items(),
                 )
                 for side in FINGERS
             ),

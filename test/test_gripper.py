@@ -188,7 +188,8 @@ class Bench:
         self.processes = {}
         for side in SIDES:
             self._start(side, "finger", folder, files, "-r", f"__ns:=/{side}")
-        self._start("gripper", "gripper", folder, [])
+        # A busy machine keeps a finger from talking for seconds.
+        self._start("gripper", "gripper", folder, [], "-p", "state_timeout:=4.0")
         self.node = rclpy.create_node("client")
         self.executor = EventsExecutor()
         self.executor.add_node(self.node)

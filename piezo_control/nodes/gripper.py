@@ -131,12 +131,8 @@ class Finger:
         self.reference: Profile | None = None
         self.zero = 0.0  # m, the deflection at which the finger is at rest
         self.heard = monotonic()
-        self._way: deque[tuple[float, float]] = (
-            deque()
-        )  # time (s) and deflection (m), the last ones
-        self.push = (
-            math.nan
-        )  # N, of the object, that bends the finger open; NaN: it does not feel any
+        self._way: deque[tuple[float, float]] = deque()  # times (s) and deflections (m) of late
+        self.push = math.nan  # N, of the object on the tip; NaN: the finger does not feel any
         self.max_force = 0.0  # N, of the goal; 0: the finger's own limit
         self._felt = 0  # number of the sample at which it felt that
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
