@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from piezo_control.design import synthesis
+from piezo_control.design import hinf, state_space
 from piezo_control.design.certificate import (
     Box,
     certify,
@@ -22,7 +22,7 @@ from piezo_control.design.certificate import (
     weighted_norms,
 )
 from piezo_control.design.cli import main, read_problem
-from piezo_control.design.problem import DesignProblem, Uncertainty
+from piezo_control.design.problem import DesignProblem, TransferFunction, Uncertainty
 from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.parameters import build, declarations, load
@@ -53,21 +53,21 @@ def paper_setting() -> DesignProblem:
 
 def test_weighted_norm_equals_that_of_the_interconnection_in_python_control():
     p = problem("fast")
-    step = p.finger.sample_time / synthesis.TIME_UNIT
+    step = p.finger.sample_time / state_space.TIME_UNIT
     design = synthesize(p)
-    plant = synthesis.generalised_plant(
-        synthesis.to_w_plane(synthesis.delayed_finger(p.finger), step),
-        *synthesis.realised_weights(p.weights),
+    plant = hinf.generalised_plant(
+        state_space.to_w_plane(hinf.delayed_finger(p.finger), step),
+        *hinf.realised_weights(p.weights),
     )
     c = design.controller
     order = c.order - 2  # without the prefilter, which is outside the loop
-    discrete = synthesis.StateSpace(
+    discrete = state_space.StateSpace(
         c.matrix("a")[:order, :order],
         c.matrix("b")[:order, None],
         c.matrix("c")[None, :order],
         np.array([[c.d]]),
     )
-    loop = control.ss(*plant).lft(control.ss(*synthesis.to_w_plane(discrete, step)), 1, 1)
+    loop = control.ss(*plant).lft(control.ss(*state_space.to_w_plane(discrete, step)), 1, 1)
     expected = control.system_norm(loop, "inf", tol=1e-8)
     assert weighted_norms(p, c)["all"] == pytest.approx(expected, rel=1e-4)
 
@@ -85,7 +85,7 @@ def test_the_papers_norm_is_not_its_gamma():
     p = dataclasses.replace(
         paper_setting(),
         method="hinf",
-        controller=synthesis.TransferFunction(),
+        controller=TransferFunction(),
         weights=problem("paper_weights").weights,
     )
     found = weighted_norms(p, synthesize(paper_setting()).controller)["performance"]
@@ -236,7 +236,7 @@ def test_from_specifications_to_a_certified_file(tmp_path):
     code = "import sys; from piezo_control.design.cli import main; sys.exit(main())"
     arguments = ["params/specifications.yaml", "--out", str(out), "--report", str(tmp_path)]
     subprocess.run(
-        [sys.executable, "-c", code, *arguments], cwd=PARAMS.parent, check=True, timeout=300
+        [sys.executable, "-c", code, *arguments], cwd=PARAMS.parent, check=True, timeout=900
     )
     controller = build(FeedbackParameters, load(out, "feedback"))
     assert controller.certified

@@ -13,31 +13,34 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piezo_control.design import synthesis
 from piezo_control.design.certificate import certify
+from piezo_control.design.hinf import (
+    delayed_finger,
+    generalised_plant,
+    realised_weights,
+    smallest_gamma,
+    solve,
+)
 from piezo_control.design.linear_loop import controller_response
 from piezo_control.design.problem import (
     DesignProblem,
     FingerModel,
     Prefilter,
+    SynthesisError,
     TransferFunction,
+    Uncertainty,
     Weights,
 )
-from piezo_control.design.synthesis import (
+from piezo_control.design.state_space import (
+    TIME_UNIT,
     StateSpace,
-    SynthesisError,
     balanced,
-    delayed_finger,
     from_w_plane,
-    generalised_plant,
     realise,
-    realised_weights,
-    shaped_weights,
-    smallest_gamma,
-    solve,
-    synthesize,
     to_w_plane,
 )
+from piezo_control.design.structures import shaped_weights
+from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.parameters import ParameterError, build, load
 
@@ -95,7 +98,7 @@ def test_smallest_gamma_of_the_fingers_coprime_problem():
 
 def test_smallest_gamma_equals_hinfsyn_of_python_control():
     p = problem("fast")
-    finger = to_w_plane(delayed_finger(p.finger), p.finger.sample_time / synthesis.TIME_UNIT)
+    finger = to_w_plane(delayed_finger(p.finger), p.finger.sample_time / TIME_UNIT)
     plant = generalised_plant(finger, *realised_weights(p.weights))
     without = plant.d.copy()
     without[-1, -1] = 0.0
@@ -126,7 +129,7 @@ def test_balancing_keeps_the_response_and_truncation_its_bound():
     transfer = 5.0 / (s + 0.01) + 1.0 / (s + 1.0) + 2.0 / (s**2 + 0.6 * s + 9.0) + 0.05 / (s + 30.0)
     numerator, denominator = (c[0][0] for c in control.tfdata(transfer))
     whole = realise(TransferFunction(tuple(numerator), tuple(denominator / 1.0)))
-    frequency = 1j * np.geomspace(1e-3, 1e3, 400) * synthesis.TIME_UNIT
+    frequency = 1j * np.geomspace(1e-3, 1e3, 400) * TIME_UNIT
 
     def response(system):
         return np.array(
@@ -256,3 +259,24 @@ def test_refuses_contradictory_problems(change, message):
 def test_refuses_what_does_not_fit(make, message):
     with pytest.raises(ParameterError, match=message):
         make()
+
+
+@pytest.mark.parametrize("method", ["given", "pid", "damped_integrator"])
+def test_a_resonance_above_nyquist_is_named(method):
+    """666.6 Hz + 20 % = 800 Hz, sampled at 1 kHz."""
+    given = TransferFunction((1.0,), (1.0, 0.0)) if method == "given" else TransferFunction()
+    finger = FingerModel(sample_time=1e-3)
+    with pytest.raises(
+        SynthesisError, match=r"up to (799.9|800) Hz .* Nyquist frequency of 500 Hz"
+    ):
+        synthesize(DesignProblem(method=method, controller=given, finger=finger))
+
+
+def test_a_box_that_no_structure_keeps_stable_is_named(monkeypatch):
+    """A finger whose gain may be anything up to 10000 times: any loop gain at 667 Hz is too much."""
+    monkeypatch.setattr("piezo_control.design.synthesis.TUNING_EVALUATIONS", 30)
+    p = DesignProblem(method="pid", uncertainty=Uncertainty(gain_low=0.01, gain_high=100.0))
+    with pytest.raises(
+        SynthesisError, match="no controller that is stable over the box: poles up to"
+    ):
+        synthesize(p)

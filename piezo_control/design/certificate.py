@@ -39,6 +39,8 @@ from piezo_control.feedback import FeedbackParameters
 STEP_BAND = 0.05
 RECORD_SETTLING_TIMES = 4.0
 DRIFT_STEP_DEGC = 10.0
+UNSTABLE = 1e3
+"""Cost, times the spectral radius, of a controller that is not stable over the box."""
 PARTS = 8
 PROOF_SLACK = 1.01
 """The first bound to be tried is so much above what the samples have."""
@@ -171,7 +173,7 @@ class Box:
         """
         radius = max(part.max() for part in self.radius(controller))
         if not radius < 1.0:
-            return 1e3 * min(radius, 100.0)
+            return UNSTABLE * min(radius, 100.0)
         worst = {
             name: float(value.max()) for name, value in self.figures(controller)._asdict().items()
         }

@@ -32,8 +32,8 @@ from rich.table import Table  # noqa: E402
 
 from piezo_control.design import plots as design_plots  # noqa: E402
 from piezo_control.design.certificate import Certificate, Row, certify  # noqa: E402
-from piezo_control.design.problem import DesignProblem  # noqa: E402
-from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
+from piezo_control.design.problem import DesignProblem, SynthesisError  # noqa: E402
+from piezo_control.design.synthesis import synthesize  # noqa: E402
 from piezo_control.feedback import FeedbackParameters  # noqa: E402
 from piezo_control.hysteresis import (  # noqa: E402
     HysteresisParameters,

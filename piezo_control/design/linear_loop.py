@@ -24,8 +24,8 @@ from piezo_control.design.problem import FingerModel
 from piezo_control.dynamics import ModesParameters
 from piezo_control.feedback import FeedbackParameters
 
-COVARIANCE_DOUBLINGS = 20
-"""A million samples: what a pole at a modulus of 1 - 1e-5 needs to forget."""
+COVARIANCE_DOUBLINGS = 16
+"""65536 samples: enough for a pole at a modulus of 1 - 1e-4 to forget."""
 
 
 class Fingers(NamedTuple):

@@ -17,6 +17,10 @@ REACH = Feedforward(FeedforwardParameters(), sample_time=1e-4).reachable_range
 METHODS = ("hinf", "given", "damped_integrator", "pid", "integrator_notch")
 
 
+class SynthesisError(ValueError):
+    """A design problem without a solution; the message says why."""
+
+
 @dataclass(frozen=True)
 class FingerModel:
     """The linear finger: D(s), amplifier, sensor delay, reachable range and slow disturbances."""

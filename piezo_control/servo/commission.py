@@ -32,7 +32,8 @@ from rich.prompt import Confirm  # noqa: E402
 
 from piezo_control.design.certificate import certify  # noqa: E402
 from piezo_control.design.cli import comment, read_problem, show  # noqa: E402
-from piezo_control.design.synthesis import SynthesisError, synthesize  # noqa: E402
+from piezo_control.design.problem import SynthesisError  # noqa: E402
+from piezo_control.design.synthesis import synthesize  # noqa: E402
 from piezo_control.feedback import FeedbackParameters  # noqa: E402
 from piezo_control.feedforward import FeedforwardParameters  # noqa: E402
 from piezo_control.hysteresis import deflection_history  # noqa: E402
