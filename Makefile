@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
 
-.PHONY: help env demo paper figures sensorless servo bench test lint coverage faults clean distclean
+.PHONY: help env demo paper figures sensorless servo grasp bench test lint coverage faults clean distclean
 
 help:
 	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
@@ -11,6 +11,7 @@ help:
 	@echo "make figures    the same, and the pictures of the README in docs/"
 	@echo "make sensorless what the models do without a sensor; results in out/sensorless"
 	@echo "make servo      the step in real time, 10 kHz, against a finger in another process; results in out/servo"
+	@echo "make grasp      a bead picked, held while it gets warm, placed, over topics; results in out/grasp"
 	@echo "make bench      speed of the loop; results in out/bench.json"
 	@echo "make lint       ruff and mypy"
 	@echo "make faults     a thousand random schedules of faults on live nodes; stopped, it goes on; prints the seeds that fail"
@@ -32,6 +33,9 @@ figures: paper
 
 sensorless: env
 	$(RUN) python -m piezo_sim.experiment.sensorless --out out/sensorless
+
+grasp: env
+	$(RUN) python -m piezo_sim.experiment.on_nodes.grasp --out out/grasp
 
 servo: env
 	$(RUN) python -m piezo_sim.experiment.on_nodes.servo --out out/servo

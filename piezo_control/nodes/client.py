@@ -17,11 +17,14 @@ asked for, so looking at a loop of thousands of samples a second costs neither i
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple
 
 import rclpy
@@ -41,9 +44,11 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
+from piezo_control.gripper import GripperParameters, reach
 from piezo_control.nodes.profile_input import ProfileInput, waveform_message
 from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.nodes.spin import LONGEST_WAIT
+from piezo_control.parameters import build
 from piezo_control.safety import LARGEST_DEFLECTION
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.action import Grip
@@ -100,14 +105,20 @@ class Reading(NamedTuple):
 
 
 class Newest:
-    """The newest message of a topic, taken when it is asked for; belongs to a node that nobody spins."""
+    """The newest message of a topic, taken when it is asked for; belongs to a node that nobody spins.
+
+    It subscribes when it is asked for the first time, as every sample costs whoever receives and sends it.
+    """
 
     def __init__(self, node: Node, kind: type, topic: str) -> None:
-        self._subscription = node.create_subscription(kind, topic, lambda _: None, LATEST)
+        self._subscribe = partial(node.create_subscription, kind, topic, lambda _: None, LATEST)
+        self._subscription: Any = None
         self._last: Any = None
 
     def __call__(self) -> Any:
         """Return the message; None before the first."""
+        if self._subscription is None:
+            self._subscription = self._subscribe()
         s = self._subscription
         with s.handle:
             taken = s.handle.take_message(s.msg_type, s.raw)
@@ -123,6 +134,8 @@ class Ros:
         self.node = node
         self.watcher = watcher
         self.timeout = timeout
+        # Action clients stay: one that is destroyed while the thread waits for it ends the thread.
+        self._grips: dict[str, ActionClient] = {}
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         """The newest of each node, by its full name."""
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -208,22 +221,24 @@ class Ros:
         on_feedback : called with opening and force on the way
         timeout : s; when it is over the goal is canceled, and the fingers hold where they are
         """
-        client = ActionClient(self.node, Grip, gripper)
+        client = self._grips.get(gripper) or ActionClient(self.node, Grip, gripper)
+        self._grips[gripper] = client
+        self.wait(client.server_is_ready, lambda: f"no gripper answers on '{gripper}'")
+        goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
+        handle = self.result(
+            client.send_goal_async(goal, lambda message: on_feedback(message.feedback)), gripper
+        )
+        if not handle.accepted:
+            raise ClientError(f"the gripper refuses this goal; its log on '{gripper}' says why")
         try:
-            self.wait(client.server_is_ready, lambda: f"no gripper answers on '{gripper}'")
-            goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
-            handle = self.result(
-                client.send_goal_async(goal, lambda message: on_feedback(message.feedback)), gripper
-            )
-            if not handle.accepted:
-                raise ClientError(f"the gripper refuses this goal; its log on '{gripper}' says why")
-            try:
-                return self.result(handle.get_result_async(), gripper, timeout).result
-            except BaseException:
-                handle.cancel_goal_async()
-                raise
-        finally:
-            client.destroy()
+            return self.result(handle.get_result_async(), gripper, timeout).result
+        except BaseException:
+            handle.cancel_goal_async()
+            raise
+
+    def gripper(self, namespace: str = "") -> Gripper:
+        """Return the gripper in a namespace."""
+        return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """Return the answer of a service."""
@@ -253,6 +268,45 @@ class Ros:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self.diagnostics.update({status.name: status for status in message.status})
+
+
+class Gripper:
+    """A gripper, such as '/gripper'; made by :meth:`Ros.gripper`.
+
+        with connect() as ros:
+            gripper = ros.gripper()
+            gripper.grasp(force=0.5e-3)
+
+    Every motion returns how it ended, once the fingers are at rest. ClientError for one that is refused.
+    """
+
+    def __init__(self, ros: Ros, node: str) -> None:
+        self.ros = ros
+        self.node = node
+        self._action = f"{node.rpartition('/')[0]}/grip"
+        values = ros.parameters(node)
+        known = {f.name for f in dataclasses.fields(GripperParameters)}
+        law = build(GripperParameters, {n: v for n, v in values.items() if n in known}, node)
+        self.narrowest, self.widest = reach(law)
+        """Openings (m) within which it moves."""
+
+    def move(self, opening: float, speed: float = 0.0, max_force: float = 0.0) -> Grip.Result:
+        """Go to an opening (m), pushing with `max_force` (N) at most; 0 for speed and force: the gripper's own."""
+        return self.ros.grip(opening, max_force, speed, self._action)
+
+    def grasp(self, force: float, speed: float = 0.0) -> Grip.Result:
+        """Close until both tips push with `force` (N), and hold that; ClientError where nothing is in between."""
+        result = self.move(self.narrowest, speed, force)
+        if not result.stalled or math.isnan(result.force):
+            raise ClientError(
+                f"'{self.node}' has grasped nothing: it is at an opening of {result.opening * 1e6:.2f} µm, force "
+                f"{result.force * 1e3:.3g} mN"
+            )
+        return result
+
+    def release(self, speed: float = 0.0) -> Grip.Result:
+        """Go to the widest opening."""
+        return self.move(self.widest, speed)
 
 
 class Finger:

@@ -49,6 +49,7 @@ FINGER = {
     "samples": (BLOCK_TYPE, SAMPLE),
     "temperature": (TEMPERATURE_TYPE, SAMPLE),
     "push": (SAMPLE_TYPE, SAMPLE),
+    "contact_force": (SAMPLE_TYPE, SAMPLE),
     "tip_force": (SAMPLE_TYPE, SAMPLE),
     "tip_force_profile": (PROFILE_TYPE, LATCHED),
     "tip_force_waveform": (WAVEFORM_TYPE, SAMPLE),

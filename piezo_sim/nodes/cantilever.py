@@ -4,7 +4,8 @@
 in:  voltage (Sample, V), temperature (sensor_msgs/Temperature, °C),
      tip_force (Sample, N: one value), tip_force_profile (Profile, N), tip_force_waveform (Waveform, N),
      fault (Fault: of the blocks of its loop)
-out: deflection (Sample, m), clock (rosgraph_msgs/Clock), state (FingerState)
+out: deflection (Sample, m), clock (rosgraph_msgs/Clock), state (FingerState); with an object in front of the tip
+     (`contact.stiffness`), contact_force (Sample, N): how it pushes the tip back, which no real finger knows
 
 In lock-step it is the master of time: it publishes deflection k, moves on when voltage k is there, and
 asks again for what is late by publishing the same sample and the same clock once more. An answer that
@@ -60,6 +61,7 @@ class CantileverNode(FingerNode):
     def __init__(self) -> None:
         super().__init__()
         self.deflections = self.create_publisher(Sample, "deflection", SAMPLE)
+        self.contact_forces = self.create_publisher(Sample, "contact_force", SAMPLE)
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
         self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_around)
@@ -170,6 +172,14 @@ class CantileverNode(FingerNode):
         blocks = "; ".join(f"{node}: {text}" for node, text in self.faults.items())
         return self.voltages.wrong() or blocks
 
+    def _publish(self, sample: Sample) -> None:
+        """Publish a deflection and, where there is an object, how that pushes the tip back."""
+        self.deflections.publish(sample)
+        if self.parameters.contact.stiffness > 0.0 and sample.number > 0:
+            force = Sample(header=sample.header, number=sample.number, period=sample.period)
+            force.value = self.tip_force[sample.number - 1] - self.plant.tip_force
+            self.contact_forces.publish(force)
+
     # --- lock-step ----------------------------------------------------------------------------------
 
     def _measure(self) -> None:
@@ -186,7 +196,7 @@ class CantileverNode(FingerNode):
             return
         if self.number % self.samples_per_clock == 0:
             self.clocks.publish(Clock(clock=stamp))
-        self.deflections.publish(sample)
+        self._publish(sample)
 
     def _ask(self) -> None:
         """Publish clock and deflection, once more where that was done, if they have their readers."""
@@ -326,7 +336,7 @@ class CantileverNode(FingerNode):
         sample = Sample(number=self.number, value=self.plant.measure(), period=p.sample_time)
         sample.header.stamp = base.wall_time(now)
         self.sample = sample
-        self.deflections.publish(sample)
+        self._publish(sample)
         if now - self.clocked >= p.clock_period:
             self.clocked = now
             self.clocks.publish(Clock(clock=sample.header.stamp))
