@@ -537,5 +537,5 @@ def run_touching_samples(
             outputs.voltage[row] = voltage
             outputs.total_force[row] = state.tip_force[0]
             outputs.true_deflection[row] = deflection_of(plant, state)
-            outputs.clips[row] = finger.law_state.models.clipped[0]
+            outputs.clips[row] = models_state.clipped[0]
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])

@@ -181,12 +181,17 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
         said = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
         neighbour.insist(deflection, sample(0, 0.0), lambda: answers)
         for number, value, unhindered in rows:
+            if number == 1:  # asked again once that is known: it is not forgotten
+                expected.publish(sample(number, unhindered))
+                assert expected.wait_for_all_acked()
+                deflection.publish(sample(0, 0.0))
             deflection.publish(sample(number, value))
-            if number == 1:
+            if number == 2:
                 neighbour.wait(
                     lambda: any("waits for '/expected'" in s.status[0].message for s in said)
                 )
-            expected.publish(sample(number, unhindered))
+            if number > 1:
+                expected.publish(sample(number, unhindered))
             neighbour.wait(lambda n=number: answers[-1].number == n)
         neighbour.wait(lambda: pushes)
     first = [a.number for a in answers].count(0)

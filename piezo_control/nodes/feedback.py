@@ -33,7 +33,7 @@ from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, flatten
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
-from piezo_control.sequence import NEW
+from piezo_control.sequence import FIRST, NEW
 from piezo_control.touch import Touch
 from piezo_gripper_msgs.msg import Sample
 
@@ -206,11 +206,11 @@ class FeedbackNode(BlockNode):
         """Let a sample in lock-step wait for what is expected of it; sample 0 is that of a finger at rest."""
         self._waiting = None
         if self._expectations and self.parameters.mode == "lockstep":
-            is_new = self.sequence.classify(sample.number) == NEW
-            if is_new and self.expected.number != sample.number:
+            kind = self.sequence.classify(sample.number)
+            if kind == NEW and self.expected.number != sample.number:
                 self._waiting = sample
                 return
-            if sample.number == 0:
+            if kind == FIRST:
                 self.expected = Sample()
         super()._on_sample(sample)
 

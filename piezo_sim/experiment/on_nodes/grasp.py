@@ -14,6 +14,7 @@ import shutil
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,13 +128,23 @@ def run(way: Way, out: Path) -> dict[str, Path]:
         ros = stack.enter_context(connect(ANSWER))
         fingers = [ros.finger(side) for side in SIDES]
         for finger in fingers:
-            finger.wait_for(
-                lambda f=finger: f.state is not None and f.state.phase == FingerState.RUNNING
-            )
+            finger.wait_for(partial(is_running, finger))
         pick_and_place(ros.gripper(), fingers, way)
         for processes in started:
             processes.check()
     return bags
+
+
+def is_running(finger: Finger) -> bool:
+    """Say whether the finger's loop runs."""
+    return finger.state is not None and finger.state.phase == FingerState.RUNNING
+
+
+def is_past(finger: Finger, time: float) -> bool:
+    """Say whether the finger's own time has passed `time` (s)."""
+    if not is_running(finger):
+        raise RunFailed(f"finger '{finger.namespace}' is {finger.words()}")
+    return finger.state is not None and finger.state.samples * SAMPLE_TIME > time
 
 
 def pick_and_place(gripper: Gripper, fingers: list[Finger], way: Way) -> None:
@@ -143,7 +154,7 @@ def pick_and_place(gripper: Gripper, fingers: list[Finger], way: Way) -> None:
     else:
         gripper.move(BEAD - 2.0 * DEEP, SPEED)
     for finger in fingers:
-        finger.wait_for(lambda f=finger: f.state.samples * SAMPLE_TIME > CARRIED_UNTIL)
+        finger.wait_for(partial(is_past, finger, CARRIED_UNTIL))
     gripper.move(REST_OPENING, SPEED)
 
 
