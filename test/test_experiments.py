@@ -387,7 +387,7 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
     for words, message in (
         (
             ("--controller", "unheard_of"),
-            "not one of the known integrator_notch, paper, pid, robust",
+            "not one of the known fast, integrator_notch, paper, pid, robust, robust_delay_2",
         ),
         (("--amplitude-v", 20.0), "--amplitude-v has no effect on any run"),
         (("--amplitude-um", 20e-6), "goes to 2e-05 um, must be 0 or from 0.01 to 1000 um"),
