@@ -106,6 +106,7 @@ setup(
             "commission = piezo_control.start:commission",
             "udp_finger = piezo_sim.start:udp_finger",
             "gripper = piezo_control.start:gripper",
+            "gripper_stack = piezo_sim.start:gripper_stack",
             "monte_carlo = piezo_sim.start:monte_carlo",
         ],
         "piezo_gripper.drivers": ["simulated = piezo_sim.driver:Simulation"],

@@ -126,7 +126,7 @@ class Waveform:
             wave = np.sin(2.0 * np.pi * whole)
         if self.shape == "decaying_sine":
             wave = wave * np.minimum(1.0, (self.cycles - phase) / (self.cycles - 1.0))
-        runs = (tau >= 0.0) & (phase < self.cycles)
+        runs = (tau >= 0.0) & (tau < (self.duration or math.inf)) & (phase < self.cycles)
         return self.offset + np.where(runs, self.amplitude * wave, 0.0)
 
     def _phase(self, tau: NDArray[np.float64]) -> NDArray[np.float64]:

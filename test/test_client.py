@@ -2,10 +2,10 @@
 """The client and `fingerctl` with a running finger and its recorder."""
 
 import io
-import math
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +15,15 @@ from ament_index_python.packages import get_package_prefix
 from rich.console import Console
 
 from piezo_control.nodes import fingerctl
-from piezo_control.nodes.client import ClientError, connect
-from piezo_control.recording.recording import read
+from piezo_control.nodes.client import LEAD_TIME, ClientError, connect
+from piezo_control.recording.reader import open_bag
+from piezo_control.recording.recording import WAVEFORM_TYPE, read
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.msg import FingerState
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
-TIMEOUT = 60.0  # s
+TIMEOUT = 180.0  # s, generous: the tests wait on conditions
+RECORDED = "[reference_waveform, deflection]"
 SAMPLE_TIME = 1e-4  # s, of the controller `robust`
 
 
@@ -30,7 +32,7 @@ def ros(tmp_path_factory):
     folder = tmp_path_factory.mktemp("client")
     commands = {
         "finger": ["-p", "controller_file:=robust"],
-        "recorder": ["-p", "autostart:=false"],
+        "recorder": ["-p", "autostart:=false", "-p", f"topics:={RECORDED}"],
     }
     processes = []
     for name, arguments in commands.items():
@@ -46,6 +48,7 @@ def ros(tmp_path_factory):
             finger = connection.finger("finger")
             finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
             finger.node("recorder")
+            connection.log = folder / "finger.log"
             yield connection
     finally:
         for process in processes:
@@ -72,6 +75,20 @@ def control(ros):
     return run
 
 
+def test_every_node_says_once_what_it_waits_for_and_that_it_runs(ros):
+    said = ros.log.read_text()
+    for words in (
+        "[finger.temperature]: waits for '/finger/clock'",
+        "[finger.temperature]: publishes '/finger/temperature'",
+        "[finger.feedback]: waits for '/finger/deflection'",
+        "[finger.feedback]: answers '/finger/deflection'",
+        "[finger.feedforward]: waits for '/finger/command'",
+        "[finger.feedforward]: answers '/finger/command'",
+        "[finger.cantilever]: running, at sample 1",
+    ):
+        assert said.count(words) == 1, said
+
+
 def near(finger, target):
     return lambda: abs(finger.newest().deflection - target) < 0.1e-6
 
@@ -85,8 +102,8 @@ def test_the_only_finger_is_found(ros, finger):
 def test_set_point_and_reading(finger):
     finger.set(10e-6)
     finger.wait_for(near(finger, 10e-6))
+    finger.wait_for(lambda: finger.newest().reference == 10e-6)
     reading = finger.newest()
-    assert reading.reference == 10e-6
     assert reading.command == pytest.approx(10e-6, abs=1e-6)
     assert reading.temperature == 22.0
     assert reading.tip_force == 0.0
@@ -97,26 +114,28 @@ def test_set_point_and_reading(finger):
 
 def test_waveform_is_followed_sample_by_sample_and_recorded(finger, tmp_path):
     """The bag's reference, evaluated at each sample, is what the finger followed."""
-    wanted = Waveform("sine", amplitude=5e-6, frequency=5.0, offset=2e-6, duration=0.2)
+    wanted = Waveform("sine", amplitude=5e-6, frequency=5.0, offset=2e-6)
     assert finger.record(str(tmp_path / "bag")) == str(tmp_path / "bag")
+    before = finger.newest().time
     finger.wave(wanted)
     sent = finger.newest().time
-    finger.wait_for(lambda: finger.newest().time > sent + 0.4)
+    finger.wait_for(lambda: finger.newest().deflection > 6.5e-6)
+    seen = finger.newest().time
+    finger.wait_for(lambda: finger.newest().time > seen + 0.2)
     finger.end_record()
+    finger.zero()
+    (message,) = open_bag(tmp_path / "bag").messages("/finger/reference_waveform", WAVEFORM_TYPE)
+    followed = Waveform.of(message)
+    assert followed == replace(wanted, start=message.start)
+    assert before <= message.start - LEAD_TIME <= sent
     recording = read(tmp_path / "bag")
-    known = np.isfinite(recording.reference)
-    time = (recording.number * SAMPLE_TIME)[known]
-    reference, deflection = recording.reference[known], recording.deflection[known]
-    start = time[np.flatnonzero(reference != 2e-6)[0] - 1]
-    assert sent < start < sent + 0.2
-    np.testing.assert_allclose(
-        reference, Waveform(**{**vars(wanted), "start": start}).at(time),
-        atol=5e-6 * 2.0 * math.pi * 5.0 * SAMPLE_TIME,  # begun between two samples
-    )  # fmt: skip
+    time = recording.number * SAMPLE_TIME
+    heard = np.isfinite(recording.reference)
+    np.testing.assert_array_equal(recording.reference[heard], followed.at(time[heard]))
     # `robust` settles within 4 ms, in which this sine moves by 0.63 µm at most; noise is 5 nm, a quantum 10 nm.
-    later = time > start
-    assert np.max(np.abs(deflection - reference)[later]) < 0.7e-6
-    assert np.ptp(deflection[later]) == pytest.approx(10e-6, rel=0.05)
+    runs = time > time[-1] - 0.2
+    assert np.max(np.abs(recording.deflection - recording.reference)[runs]) < 0.7e-6
+    assert np.ptp(recording.deflection[runs]) == pytest.approx(10e-6, rel=0.05)
 
 
 def test_waveform_too_fast_for_the_loop_is_ignored_and_too_large_ones_are_refused(finger):
@@ -156,6 +175,8 @@ def test_fault_is_in_words_and_reset_ends_it(ros, finger):
     ros.lifecycle("/finger/feedforward", "deactivate")
     finger.wait_for(lambda: finger.state.phase == FingerState.FAULT)
     assert "fault: no answer to sample" in finger.words()
+    way_on = "service '/finger/cantilever/reset' (`fingerctl reset`) or a new activation goes on"
+    assert way_on in ros.log.read_text()
     ros.lifecycle("/finger/feedforward", "activate")
     assert set(finger.reset()) == set(finger.nodes())
     finger.wait_for(lambda: finger.words() == "running")
@@ -166,7 +187,7 @@ def test_fingerctl_moves_and_shows(control, finger):
     assert near(finger, 8e-6)()
     code, text = control("state")
     assert code == 0
-    assert "running" in text and "deflection [µm]" in text
+    assert "running" in text and "deflection [µm]" in text and "tip force [mN]" in text
     code, text = control("watch", "--seconds", "0.5")
     assert code == 0 and "reference [µm]" in text
     assert control("zero") == (0, "")

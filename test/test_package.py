@@ -29,6 +29,7 @@ EXECUTABLES = {
     "synthesize",
     "monte_carlo",
     "gripper",
+    "gripper_stack",
     "servo",
     "commission",
     "export",

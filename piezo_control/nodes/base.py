@@ -108,6 +108,7 @@ class FingerNode(LifecycleNode):
                 self.declare_parameter(name, value, describe(name, kind, field))
         self.parameters: Any = build(self.PARAMETERS, self._values({}), self.NAME)
         self.active = False
+        self._said = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -121,6 +122,17 @@ class FingerNode(LifecycleNode):
         """Return a timer (s) that neither simulated time nor a change of the system's clock can stop."""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         return self.create_timer(period, callback, clock=steady, autostart=autostart)
+
+    def say(self, text: str) -> None:
+        """Log what the node does from now on, or waits for; the same again is not said twice."""
+        if text != self._said:
+            self._said = text
+            self.get_logger().info(text)
+
+    def way_on(self) -> str:
+        """Return how people leave a latched fault."""
+        name = self.get_fully_qualified_name()
+        return f"service '{name}/reset' (`fingerctl reset`) or a new activation goes on"
 
     def reset(self) -> None:
         """Leave a latched fault; a ValueError raised here says why that cannot be."""
@@ -201,6 +213,7 @@ class FingerNode(LifecycleNode):
                 f"reset; it was: {wrong}" if wrong else "no fault",
             )
             self.get_logger().info(answer.message)
+            self._said = ""
         self.publish_diagnostics()
         return answer
 
@@ -208,6 +221,7 @@ class FingerNode(LifecycleNode):
         if self.active:
             self.stop()
             self.active = False
+            self.say("not active")
 
     def _promoted(self, given: list[Parameter]) -> list[Parameter]:
         """Return the `given` parameters with whole numbers as doubles where doubles are declared."""
@@ -298,6 +312,8 @@ def run(*node_types: type[FingerNode]) -> int:
             if node.get_parameter("autostart").value:
                 if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                     node.trigger_activate()
+            else:
+                node.say("waits to be configured and activated, as by `fingerctl lifecycle`")
         spin.spin(nodes, stop.is_set)
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
         print(f"{node_types[min(len(nodes), len(node_types) - 1)].NAME}: {error}", file=sys.stderr)

@@ -62,6 +62,7 @@ class BlockNode(FingerNode):
         self.last = Sample()
         self.sequence = Sequence()
         self.guard = Guard(hold_time=1.0)
+        self._answers = False
         self.finger: FingerState | None = None
         self.create_subscription(FingerState, "state", self._on_state, LATCHED)
         self._input = SoleInput(
@@ -79,7 +80,8 @@ class BlockNode(FingerNode):
     def trip(self, cause: str) -> None:
         """Latch a fault."""
         if not self.guard.is_latched:
-            self.get_logger().error(f"{cause}; no more answers until '~/reset' or a new activation")
+            self.get_logger().error(f"{cause}; no more answers; {self.way_on()}")
+            self._answers = False
         self.guard.trip(cause, time.monotonic(), at_rest=not self.MOVES_VOLTAGE)
         self._tell()
 
@@ -99,6 +101,8 @@ class BlockNode(FingerNode):
                 self, self.INPUT, self._on_sample, self._quality(), self._look_at_input
             )
         self.sequence = Sequence(gaps=self.parameters.mode == "free_running")
+        self._answers = False
+        self.say(f"waits for '{self.resolve_topic_name(self.INPUT)}'")
         self._rearm()
 
     def reset(self) -> None:
@@ -158,7 +162,12 @@ class BlockNode(FingerNode):
                     throttle_duration_sec=1.0,
                 )
                 return
-            if self.answers.get_subscription_count() < self.parameters.subscribers:
+            readers = self.answers.get_subscription_count()
+            if readers < self.parameters.subscribers:
+                self.say(
+                    f"waits for {self.parameters.subscribers} subscribers of '{self.answers.topic_name}': "
+                    f"{readers} are there"
+                )
                 return  # the cantilever asks again
         if wrong := wrong_time(sample, self.INPUT, self.parameters, self.NAME):
             self.trip(wrong)
@@ -185,3 +194,6 @@ class BlockNode(FingerNode):
         if self.compute(sample, answer):
             self.answers.publish(answer)
             self.last = answer
+            if not self._answers:
+                self._answers = True
+                self.say(f"answers '{self.resolve_topic_name(self.INPUT)}'")

@@ -24,6 +24,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -45,6 +46,7 @@ from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
 from piezo_control.gripper import GripperParameters, reach
+from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput, waveform_message
 from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.nodes.spin import LONGEST_WAIT
@@ -70,15 +72,6 @@ TRANSITIONS = {
     "deactivate": Transition.TRANSITION_DEACTIVATE,
     "cleanup": Transition.TRANSITION_CLEANUP,
 }
-PHASES = {
-    FingerState.IDLE: "idle",
-    FingerState.WAITING: "waiting",
-    FingerState.RUNNING: "running",
-    FingerState.FINISHED: "finished",
-    FingerState.FAULT: "fault",
-    FingerState.HOLDING: "holding",
-    FingerState.RAMPING: "ramping to rest",
-}
 
 
 class ClientError(RuntimeError):
@@ -91,7 +84,7 @@ class Reading(NamedTuple):
     time: float
     """s since sample 0, in the finger's own time."""
     reference: float
-    """m; of those that came since this client began."""
+    """m; NaN before the first that came since this client began."""
     deflection: float
     """m"""
     command: float
@@ -321,7 +314,10 @@ class Finger:
         node, watcher = ros.node, ros.watcher
         node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
         # Which frequencies its loop can follow the finger says, so here any sample time will do.
-        self._reference = ProfileInput(node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION)
+        self._reference = ProfileInput(
+            node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION, self._on_reference
+        )
+        self._knows_reference = False
         self._set_points = node.create_publisher(Sample, f"{self.prefix}reference", SETPOINT)
         self._waveforms = node.create_publisher(
             WaveformMessage, f"{self.prefix}reference_waveform", SETPOINT
@@ -346,7 +342,7 @@ class Finger:
         values = {name: getattr(take(), "value", nan) for name, take in self._samples.items()}
         return Reading(
             time=elapsed,
-            reference=float(self._reference.signal.at(elapsed)) if deflection else nan,
+            reference=float(self._reference.signal.at(elapsed)) if self._knows_reference else nan,
             temperature=getattr(
                 self._temperature(), "temperature", state.temperature if state else nan
             ),
@@ -374,7 +370,7 @@ class Finger:
             raise ClientError(
                 f"deflection is {deflection:g} m, must be within ±{LARGEST_DEFLECTION:g} m: metres?"
             )
-        self._send(self._set_points, Sample(value=deflection))
+        self._send(self._set_points, lambda: Sample(value=deflection))
 
     def zero(self) -> None:
         """Let the finger go to a deflection of 0 and stay there."""
@@ -390,12 +386,14 @@ class Finger:
                 f"the waveform goes up to {waveform.largest:g} m, must be within ±{LARGEST_DEFLECTION:g} m"
             )
         self.wait_for(lambda: self.newest().time >= 0.0)
-        message = waveform_message(waveform)
-        message.start = self.newest().time + LEAD_TIME
+
+        def message() -> WaveformMessage:
+            return waveform_message(replace(waveform, start=self.newest().time + LEAD_TIME))
+
         self._send(self._waveforms, message)
 
-    def _send(self, publisher: Any, message: Any) -> None:
-        """Publish to a node that follows references, and see that it arrives."""
+    def _send(self, publisher: Any, message: Callable[[], Any]) -> None:
+        """Publish what `message()` returns then, to a node that follows references; see that it arrives."""
 
         def followers() -> list[str]:
             found = self.ros.node.get_subscriptions_info_by_topic(publisher.topic_name)
@@ -407,7 +405,7 @@ class Finger:
             ),
             lambda: f"nobody follows '{publisher.topic_name}': {self.words()}",
         )
-        publisher.publish(message)
+        publisher.publish(message())
         publisher.wait_for_all_acked(Duration(seconds=self.ros.timeout))
 
     # --- the loop -----------------------------------------------------------------------------------
@@ -475,6 +473,9 @@ class Finger:
         recorder = self.node("recorder")
         self.ros.lifecycle(recorder, "deactivate")
         self.ros.lifecycle(recorder, "cleanup")
+
+    def _on_reference(self) -> None:
+        self._knows_reference = True
 
     def _on_state(self, state: FingerState) -> None:
         self.state = state

@@ -62,7 +62,7 @@ class FeedforwardNode(BlockNode):
         self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
         self._waiting: Sample | None = None  # for its temperature
         self._subscription: Subscription | None = None
-        self._said = ""
+        self._complained = ""
         self._build(0.0)
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
@@ -152,14 +152,16 @@ class FeedforwardNode(BlockNode):
         if not self._settled and not math.isnan(degc):
             law.settle(degc)
             self._settled = True
-        if self.thermometer.wrong != self._said:
-            self._said = self.thermometer.wrong
-            if not self._said:
+        if self.thermometer.wrong != self._complained:
+            self._complained = self.thermometer.wrong
+            if not self._complained:
                 self.get_logger().info(f"temperature is back: {degc:g} °C")
             elif self.parameters.thermometer.fallback == "fault":
-                self.trip(self._said)
+                self.trip(self._complained)
             else:
-                self.get_logger().error(f"{self._said}; the models go on with {law.body_degc:g} °C")
+                self.get_logger().error(
+                    f"{self._complained}; the models go on with {law.body_degc:g} °C"
+                )
             self.publish_diagnostics()
         return degc
 
@@ -236,7 +238,7 @@ class FeedforwardNode(BlockNode):
         self.guard.look(now, 2.0 * self.parameters.sample_time + RAMP_PERIOD, "command")
         if self.guard.phase != before and self.guard.is_latched:
             self.get_logger().error(
-                f"{self.guard.cause}: voltage goes to rest and stays there until '~/reset'"
+                f"{self.guard.cause}: voltage goes to rest and stays there; {self.way_on()}"
             )
             self._tell()
         if self.guard.phase == RAMPING:

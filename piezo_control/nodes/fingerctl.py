@@ -22,12 +22,14 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from piezo_control.nodes.client import TRANSITIONS, ClientError, Finger, Ros, connect
 from piezo_control.waveform import SHAPES, Waveform
 from piezo_gripper_msgs.msg import FingerState
 
 WATCH_PERIOD = 0.1  # s
+DISCOVERY = 1.0  # s, in which the others become known after the first
 TRACE = 40  # readings
 BARS = "▁▂▃▄▅▆▇█"
 IN_ORDER = (FingerState.WAITING, FingerState.RUNNING, FingerState.FINISHED)
@@ -75,8 +77,9 @@ def is_near(finger: Finger, target: float, near: float) -> bool:
 
 def list_all(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     """Print the fingers that are there and their nodes."""
-    found = [ros.finger()] if not ros.fingers() else [Finger(ros, n) for n in ros.fingers()]
-    for finger in found:
+    ros.wait(lambda: bool(ros.fingers()), lambda: "no finger is running in this ROS domain")
+    time.sleep(DISCOVERY)
+    for finger in (Finger(ros, name) for name in ros.fingers()):
         names = [name.rpartition("/")[2] for name in finger.nodes()]
         console.print(f"{finger.namespace}: {', '.join(names)}", highlight=False)
     return 0
@@ -211,7 +214,7 @@ def overview(chosen: list[Finger], traces: dict[str, deque[float]] | None = None
     for finger in chosen:
         table.add_column(finger.namespace, justify="right")
     for title, cell in ROWS.items():
-        table.add_row(title, *(cell(f, f.newest()) for f in chosen))
+        table.add_row(Text(title), *(Text(cell(f, f.newest())) for f in chosen))
     if traces:
         table.add_row("deflection", *(sparkline(traces[f.namespace]) for f in chosen))
     return table

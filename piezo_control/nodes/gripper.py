@@ -54,6 +54,7 @@ from piezo_control.nodes.faces.asker import Asker, Measured
 from piezo_control.nodes.faces.joint_commands import JointCommands
 from piezo_control.nodes.faces.joint_states import JointStates
 from piezo_control.nodes.faces.services import Services
+from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED, NEWEST
 from piezo_control.parameters import ParameterError, parameter
@@ -66,13 +67,6 @@ DELIVERY_TIMEOUT = Duration(seconds=0.5)
 VELOCITY_WINDOW = 0.1  # s of the finger's time: the sensor's quantum of 10 nm is 0.1 µm/s then
 PUSH_TIMEOUT = 0.5  # s of the finger's time; pushes come every 10 ms of it
 LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second
-PHASES = {
-    FingerState.IDLE: "IDLE",
-    FingerState.WAITING: "WAITING",
-    FingerState.RUNNING: "RUNNING",
-    FingerState.FINISHED: "FINISHED",
-    FingerState.FAULT: "FAULT",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -186,13 +180,23 @@ class Finger:
         topic = self._node.resolve_topic_name(f"{self.name}/state")
         return f"finger '{self.name}' is silent: nothing on '{topic}' for {silence:.1f} s"
 
+    def missing(self) -> str:
+        """Return in words what keeps the finger from moving, the same as long as it does."""
+        if self.silence():
+            topic = self._node.resolve_topic_name(f"{self.name}/state")
+            return f"finger '{self.name}' (nothing on '{topic}')"
+        if self.state.phase != FingerState.RUNNING:
+            return f"finger '{self.name}' (it is {PHASES[self.state.phase]})"
+        return f"finger '{self.name}' (it feels no more)"
+
     def problem(self) -> str:
         """Return why the finger cannot move, or nothing."""
         if silence := self.silence():
             return silence
         if self.state.phase != FingerState.RUNNING:
             text = f" ({self.state.text})" if self.state.text else ""
-            return f"finger '{self.name}' is {PHASES[self.state.phase]}{text}, must be RUNNING"
+            phase = PHASES[self.state.phase].upper()
+            return f"finger '{self.name}' is {phase}{text}, must be RUNNING"
         samples = self.state.samples - self._felt
         if not self.numbness() and samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
             topic = self._node.resolve_topic_name(f"{self.name}/push")
@@ -415,6 +419,8 @@ class GripperNode(FingerNode):
 
     def _watch(self) -> None:
         if self.motion is None:
+            missing = [finger.missing() for finger in self.fingers if finger.problem()]
+            self.say(f"waits for {' and '.join(missing)}" if missing else "ready: both fingers run")
             return
         for finger in self.fingers:
             if finger.problem():

@@ -135,6 +135,7 @@ class RecorderNode(FingerNode):
             self.tracks[topic] = Track(topic, connection, writer.has_header(name))
         self.writer = writer
         self.trouble = ""
+        self.say(f"records into {bag.resolve()}")
         for topic, data in self.latched.items():
             self._write(topic, data)
 

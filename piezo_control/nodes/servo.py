@@ -24,6 +24,7 @@ from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
+from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError
@@ -34,7 +35,7 @@ from piezo_control.servo.loop import Samples, Servo
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 
 TARGET_TIME = 0.1  # s that the error stays small before a finger is on target
-PHASES = {
+PHASE_OF = {
     NORMAL: FingerState.RUNNING,
     HOLDING: FingerState.HOLDING,
     RAMPING: FingerState.RAMPING,
@@ -220,7 +221,7 @@ class ServoNode(FingerNode):
         """Say in `state` and the log what the loop's guard does."""
         s = self.servo
         assert s is not None
-        phase = PHASES[s.phase]
+        phase = PHASE_OF[s.phase]
         if phase == self.phase:
             return
         before, self.phase = self.phase, phase
@@ -230,9 +231,11 @@ class ServoNode(FingerNode):
             self._since = time.monotonic()
         if phase in LATCHED_PHASES and before not in LATCHED_PHASES:
             self.get_logger().error(
-                f"{s.cause}; voltage goes to rest and stays there until '~/reset'"
+                f"{s.cause}; voltage goes to rest and stays there; {self.way_on()}"
             )
             self.publish_diagnostics()
+        elif phase != FingerState.FAULT:
+            self.say(PHASES[phase])
         self._publish_state()
 
     def _publish_state(self) -> None:

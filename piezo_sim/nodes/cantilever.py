@@ -27,6 +27,7 @@ from sensor_msgs.msg import Temperature
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.block import seconds, wrong_time
+from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
 from piezo_control.nodes.sole_input import SoleInput
@@ -51,7 +52,8 @@ from piezo_sim.plant.cantilever import Cantilever
 
 JITTER_WINDOW = 1000  # periods: to sort more takes longer than a period
 RETRY_PERIOD = 0.1  # s
-PHASES = {HOLDING: FingerState.HOLDING, RAMPING: FingerState.RAMPING, FAULT: FingerState.FAULT}
+SAID = (FingerState.RUNNING, FingerState.FINISHED)
+PHASE_OF = {HOLDING: FingerState.HOLDING, RAMPING: FingerState.RAMPING, FAULT: FingerState.FAULT}
 
 
 class CantileverNode(FingerNode):
@@ -277,6 +279,7 @@ class CantileverNode(FingerNode):
             return
         if self.phase == FingerState.WAITING:
             self.text = f"waiting for sample 0: {self._missing()}"
+            self.say(self.text)
         else:
             self.asked_again += 1
         self._ask()
@@ -320,7 +323,7 @@ class CantileverNode(FingerNode):
         self.guard.look(now, 2.0 * p.sample_time + RETRY_PERIOD * p.hold_time, "voltage")
         if self.guard.is_latched and not was_latched:
             self.get_logger().error(
-                f"{self.guard.cause}: voltage goes to rest and stays there until '~/reset'"
+                f"{self.guard.cause}: voltage goes to rest and stays there; {self.way_on()}"
             )
         due = int((now - self.begun) / p.sample_time) + 1
         if p.samples:
@@ -351,7 +354,7 @@ class CantileverNode(FingerNode):
             phase = FingerState.WAITING if is_waiting else FingerState.RUNNING
             text = f"waiting for '{self.resolve_topic_name('voltage')}'" if is_waiting else ""
         else:
-            phase, text = PHASES[self.guard.phase], self.guard.cause
+            phase, text = PHASE_OF[self.guard.phase], self.guard.cause
         self.text = text
         if phase != self.phase:
             self._enter(phase, text)
@@ -364,11 +367,11 @@ class CantileverNode(FingerNode):
         if was_latched:
             return
         if self.parameters.mode == "free_running":
-            self.get_logger().error(f"{text}; voltage goes to rest and stays there until '~/reset'")
+            self.get_logger().error(
+                f"{text}; voltage goes to rest and stays there; {self.way_on()}"
+            )
             return
-        self.get_logger().error(
-            f"{text}; voltage ramped to rest; '~/reset' or a new activation begins a new run"
-        )
+        self.get_logger().error(f"{text}; voltage ramped to rest; {self.way_on()} with a new run")
         self._end(FingerState.FAULT, text)
 
     def _end(self, phase: int, text: str = "") -> None:
@@ -388,6 +391,8 @@ class CantileverNode(FingerNode):
     def _enter(self, phase: int, text: str = "") -> None:
         self.phase = phase
         self.text = text
+        if phase in SAID or phase == FingerState.WAITING and text:
+            self.say(f"{PHASES[phase]}, at sample {self.number}" if phase in SAID else text)
         self._publish_state()
 
     def _publish_state(self) -> None:

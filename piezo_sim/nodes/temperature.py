@@ -40,6 +40,9 @@ class TemperatureNode(FingerNode):
         if self.parameters.mode == "free_running":
             self.tick.timer_period_ns = round(self.parameters.period * 1e9)
             self.tick.reset()
+            self.say(f"publishes '{self.temperatures.topic_name}'")
+        else:
+            self.say(f"waits for '{self.resolve_topic_name('clock')}'")
 
     def stop(self) -> None:
         self.tick.cancel()
@@ -56,6 +59,7 @@ class TemperatureNode(FingerNode):
         self.last_clock = now
         end = math.floor((now + p.ahead) / p.period + 1e-9) + 1
         self._publish(end)
+        self.say(f"publishes '{self.temperatures.topic_name}'")
 
     def _publish(self, end: int) -> None:
         """Publish the grid's temperatures from `self.next` up to, not including, `end`."""

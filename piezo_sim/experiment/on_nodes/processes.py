@@ -8,7 +8,9 @@ import os
 import signal
 import subprocess
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from typing import Any
 
 from ament_index_python.packages import get_package_prefix
 
@@ -35,9 +37,9 @@ class NodeProcesses:
     Parameters
     ----------
     commands : mapping of str to sequence of str
-        Executable name to its command-line arguments.
-    log_folder : Path
-        Gets one log file per node.
+        Executable to its command-line arguments; a folder in front tells several of a kind apart.
+    log_folder : Path, optional
+        Gets one log file per node; without it, what nodes say comes out where this process' own words do.
 
     Attributes
     ----------
@@ -45,13 +47,14 @@ class NodeProcesses:
         The processes while the context is open.
     """
 
-    def __init__(self, commands: Mapping[str, Sequence[str]], log_folder: Path) -> None:
+    def __init__(
+        self, commands: Mapping[str, Sequence[str]], log_folder: Path | None = None
+    ) -> None:
         self._commands = commands
         self._log_folder = log_folder
         self.running: dict[str, subprocess.Popen] = {}
 
     def __enter__(self) -> NodeProcesses:
-        self._log_folder.mkdir(parents=True, exist_ok=True)
         try:
             for name in self._commands:
                 self.start(name)
@@ -62,19 +65,19 @@ class NodeProcesses:
 
     def start(self, name: str) -> None:
         """Start the process `name`; where it was started before, its log goes on."""
-        with self._log(name).open("ab" if name in self.running else "wb") as log:
+        with self._output(name, "ab" if name in self.running else "wb") as output:
             self.running[name] = subprocess.Popen(
                 [*self.program(name), *self._commands[name]],
                 stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
+                stdout=output,
+                stderr=subprocess.STDOUT if output else None,
                 start_new_session=True,
                 preexec_fn=end_with_parent,
             )
 
     def program(self, name: str) -> list[str]:
         """Return what is run as `name`: the package's executable."""
-        return [str(Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE / name)]
+        return [str(Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE / Path(name).name)]
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -90,8 +93,11 @@ class NodeProcesses:
                 how = (
                     f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended ({code})"
                 )
-                words = self._log(name).read_text(errors="replace").splitlines()[-LOG_TAIL:]
-                raise NodeDied("\n  ".join([f"node '{name}' {how}; log {self._log(name)}", *words]))
+                if self._log_folder is None:
+                    raise NodeDied(f"node '{name}' {how}")
+                log = self._log_folder / f"{name}.log"
+                words = log.read_text(errors="replace").splitlines()[-LOG_TAIL:]
+                raise NodeDied("\n  ".join([f"node '{name}' {how}; log {log}", *words]))
 
     def stop(self) -> None:
         """End every process: SIGTERM, and SIGKILL for what is still there after the grace period."""
@@ -106,5 +112,10 @@ class NodeProcesses:
                 process.wait()
         self.running.clear()
 
-    def _log(self, name: str) -> Path:
-        return self._log_folder / f"{name}.log"
+    def _output(self, name: str, mode: str) -> AbstractContextManager[Any]:
+        """Return where a node's words go to; None: where those of this process do."""
+        if self._log_folder is None:
+            return nullcontext()
+        log = self._log_folder / f"{name}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        return log.open(mode)
