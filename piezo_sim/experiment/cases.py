@@ -229,8 +229,9 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
         for case in _expand(experiment, _overridden(run, overrides), where)
     ]
     names = [case.name for case in cases]
-    for double in {name for name in names if names.count(name) > 1}:
-        raise ParameterError(f"two cases are called '{double}': name nothing twice")
+    for name in names:
+        if names.count(name) > 1:
+            raise ParameterError(f"two cases are called '{name}': name nothing twice")
     return title, cases
 
 
