@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
 
-.PHONY: help env demo paper figures sensorless servo grasp bench test lint coverage faults clean distclean
+.PHONY: help env demo paper figures sensorless servo grasp bench test lint coverage faults docs clean distclean
 
 help:
 	@echo "make demo       the paper's step responses over ROS 2 topics; results in out/demo"
@@ -16,6 +16,7 @@ help:
 	@echo "make lint       ruff and mypy"
 	@echo "make faults     a thousand random schedules of faults on live nodes; stopped, it goes on; prints the seeds that fail"
 	@echo "make coverage   the tests once more, and the lines that none of them reaches"
+	@echo "make docs       these pages as a site, with links checked; in out/docs (CPython 3.11 or newer)"
 	@echo "make env        only the environment; then '. ./setup.bash' to start single nodes"
 	@echo "make clean      remove what was built; distclean: the environment and the results too"
 
@@ -54,6 +55,14 @@ faults: env
 
 coverage: env
 	$(RUN) coverage erase && coverage run -m pytest && coverage combine --quiet && coverage report
+
+docs: env build/docs/installed
+	$(RUN) PYTHONPATH=build/docs:$$PYTHONPATH python -m sphinx -W --keep-going --quiet docs out/docs
+
+build/docs/installed: docs/requirements.txt
+	rm -rf build/docs
+	.venv/bin/python -m pip install --quiet --no-input --disable-pip-version-check --no-deps --target build/docs --requirement $<
+	touch $@
 
 clean:
 	rm -rf build install log

@@ -56,13 +56,13 @@ setup(
                 *PARAMS,
                 *DESCRIPTION,
                 *glob("launch/*.launch.py"),
+                *glob("layouts/*"),
                 *glob("msg_defs/msg/*.msg"),
             ]
         ),
     ],
     python_requires=">=3.10",
     install_requires=[
-        "control",
         "jinja2",
         "matplotlib",
         "mcap",  # no rosdep key: without it all works but the reading of MCAP bags
@@ -79,6 +79,7 @@ setup(
         "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
         "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
         "test": [
+            "control",
             "coverage",
             "hypothesis",
             "mypy",

@@ -130,7 +130,14 @@ def test_executables_are_installed():
 
 
 @pytest.mark.parametrize(
-    "pattern", ["params/**/*.yaml", "params/**/*.xml", "launch/*.launch.py", "description/**/*.*"]
+    "pattern",
+    [
+        "params/**/*.yaml",
+        "params/**/*.xml",
+        "launch/*.launch.py",
+        "description/**/*.*",
+        "layouts/*",
+    ],
 )
 def test_data_files_are_installed_as_they_are(pattern):
     share = Path(get_package_share_directory("piezo_gripper"))

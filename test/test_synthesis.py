@@ -3,6 +3,7 @@
 
 import dataclasses
 import math
+import sys
 import warnings
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from piezo_control.design import hinf
 from piezo_control.design.certificate import certify
 from piezo_control.design.hinf import (
     delayed_finger,
@@ -280,3 +282,12 @@ def test_a_box_that_no_structure_keeps_stable_is_named(monkeypatch):
         SynthesisError, match="no controller that is stable over the box: poles up to"
     ):
         synthesize(p)
+
+
+def test_only_a_design_from_weights_needs_slycot(monkeypatch):
+    monkeypatch.setitem(sys.modules, "slycot", None)  # as where it is not installed
+    hinf.slicot.cache_clear()
+    with pytest.raises(SynthesisError, match="'hinf' needs slycot .GPL-2.0."):
+        synthesize(problem("fast"))
+    assert synthesize(problem("paper")).controller.order == 3
+    hinf.slicot.cache_clear()

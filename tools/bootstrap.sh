@@ -130,7 +130,7 @@ sources=$({
   echo "$place $pins"
   cat package.xml setup.py setup.cfg tools/*.bash tools/*.cmake
   cat piezo_control/servo/drivers/*.[ch]
-  find params launch description piezo_control piezo_sim '(' -name __init__.py -o -path 'params/*' -o -path 'launch/*' \
+  find params launch layouts description piezo_control piezo_sim '(' -name __init__.py -o -path 'params/*' -o -path 'launch/*' -o -path 'layouts/*' \
     -o -path 'description/*' ')' -type f |
     grep -v __pycache__ | LC_ALL=C sort
   find msg_defs -type f -print0 | LC_ALL=C sort -z | xargs -0 sha256sum

@@ -4,7 +4,8 @@
 The problem is a ROS parameter file for the node name `synthesize`: finger, uncertainty,
 specifications, and either weights or nothing, in which case they are found from the specifications.
 The controller is written only when the recomputed closed loop meets every specification (or with
---force, and then says that it is not certified). Next to it, into --report: certificate.json, the
+--force, and then says that it is not certified). With --cantilever, a finger of which a block was neither
+identified nor written by hand is refused, unless --assume says that the paper's may stand for it. Next to it, into --report: certificate.json, the
 complete problem with everything that was found, and pictures.
 
 Exit code: 0 certified, 1 not certified, 2 unusable input or a problem without a solution.
@@ -19,7 +20,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,7 @@ def main() -> int:
     begin = time.perf_counter()
     try:
         problem = read_problem(arguments.problem, arguments.cantilever)
+        origin = finger_origin(arguments.problem, arguments.cantilever, arguments.assume)
         out = arguments.out or Path(f"feedback_{problem.name}.yaml")
         if out.exists() and not arguments.overwrite:
             raise ParameterError(f"{out} exists; name a new --out or give --overwrite")
@@ -72,21 +74,65 @@ def main() -> int:
         return 2
     certificate = certify(design.problem, design.controller, design.gamma)
     show(console, certificate)
+    console.print(origin, highlight=False, markup=False)
     report = arguments.report or Path("out", "synthesize", problem.name)
-    written = write_report(report, design.problem, design.controller, certificate)
+    written = write_report(report, design.problem, design.controller, certificate, origin)
     if certificate.met or arguments.force:
         controller = dataclasses.replace(design.controller, certified=certificate.met)
         out.parent.mkdir(parents=True, exist_ok=True)
-        dump(out, "feedback", flatten(controller), comment(certificate, arguments.problem))
+        head = comment(certificate, arguments.problem)
+        dump(out, "feedback", flatten(controller), f"{head}\n{origin}")
         written.append(out)
     for path in written:
         console.print(f"wrote {path}", soft_wrap=True)
     console.print(f"took {time.perf_counter() - begin:.1f} s")
     if not certificate.met:
-        failed = ", ".join(row.specification for row in certificate.rows if not row.met)
-        hint = "" if arguments.force else f"; {out} is only written with --force"
-        print(f"synthesize: NOT certified: {failed}{hint}", file=sys.stderr)
+        failed = "; ".join(distance(row) for row in certificate.rows if not row.met)
+        hint = "" if arguments.force else f". {out} is only written with --force"
+        print(f"synthesize: NOT certified. The best design found: {failed}{hint}", file=sys.stderr)
     return 0 if certificate.met else 1
+
+
+def distance(row: Row) -> str:
+    """Say how far the worst finger is from what a line of the certificate requires, and which one it is."""
+    unit = f" {row.unit}" if row.unit else ""
+    where = f" ({row.at})" if row.at else ""
+    return f"{row.specification} {row.worst:.4g}{unit}, required {row.relation} {row.required:.4g}{unit}{where}"
+
+
+BLOCKS = {
+    "dynamics": ("dynamics.denominator",),
+    "hysteresis": ("hysteresis.weights",),
+    "limits": ("amplifier.voltage_low", "amplifier.voltage_high"),
+}
+"""What a certificate rests upon, and the parameters of a cantilever that say it."""
+ASSUMED = "ASSUMED, the paper's"
+
+
+def finger_origin(problem: Path, cantilever: Path | None, assume: Sequence[str] = ()) -> str:
+    """Return lines that say where the finger of a design comes from, block by block.
+
+    Raises ParameterError naming file and blocks when a block of `cantilever` is missing, so that the paper's
+    finger would take its place, and is not one of `assume`.
+    """
+    if cantilever is None:
+        return f"finger: as {problem.name} has it, and the paper's where it says nothing"
+    said = load(cantilever, "cantilever")
+    missing = [block for block, names in BLOCKS.items() if not all(name in said for name in names)]
+    refused = [block for block in missing if block not in assume]
+    if refused:
+        raise ParameterError(
+            f"{cantilever}: says nothing of {', '.join(refused)} of this finger, so a certificate would be of "
+            f"the paper's: `identify dynamics` and `identify hysteresis` find the first two, {BLOCKS['limits'][0]} "
+            f"and {BLOCKS['limits'][1]} are yours to write; or --assume {' '.join(refused)}"
+        )
+    lines = [
+        f"finger, {block}: " + (ASSUMED if block in missing else f"from {cantilever}")
+        for block in BLOCKS
+    ]
+    # What `identify` and `commission` say of their fits.
+    lines += [line[2:] for line in cantilever.read_text().splitlines() if line.startswith("# ")]
+    return "\n".join(lines)
 
 
 def read_problem(path: Path, cantilever: Path | None = None) -> DesignProblem:
@@ -142,11 +188,15 @@ def write_report(
     problem: DesignProblem,
     controller: FeedbackParameters,
     certificate: Certificate,
+    origin: str,
 ) -> list[Path]:
-    """Write certificate, complete problem and pictures; return their paths."""
+    """Write certificate, complete problem and pictures; return their paths. `origin` is the finger's."""
     folder.mkdir(parents=True, exist_ok=True)
     as_json = folder / "certificate.json"
-    as_json.write_text(json.dumps(_finite(certificate.as_dict()), indent=2) + "\n")
+    as_json.write_text(
+        json.dumps(_finite({**certificate.as_dict(), "origin": origin.splitlines()}), indent=2)
+        + "\n"
+    )
     solved = folder / "problem.yaml"
     dump(
         solved,
@@ -255,6 +305,10 @@ def parse() -> argparse.Namespace:
         help="parameter file of the cantilever, as `identify` writes it: its D(s), modes, amplifier, sample "
         "time, delay and thermal lag instead of the problem's",
     )
+    parser.add_argument(
+        "--assume", nargs="+", default=[], choices=BLOCKS, metavar="BLOCK",
+        help=f"with --cantilever: take the paper's for these, if it says nothing: {', '.join(BLOCKS)}",
+    )  # fmt: skip
     parser.add_argument(
         "--force", action="store_true", help="write the controller though it is not certified"
     )

@@ -16,12 +16,12 @@ weight keeps the problem regular.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from types import ModuleType
 
 import numpy as np
 import scipy.linalg
-import slycot
-import slycot.exceptions
 
 from piezo_control.design import linear_loop
 from piezo_control.design.problem import DesignProblem, FingerModel, SynthesisError, Weights
@@ -119,6 +119,18 @@ def generalised_plant(
     return StateSpace(a, b, c, direct)
 
 
+@functools.cache
+def slicot() -> ModuleType:
+    """Return slycot, whose licence is GPL-2.0: a controller from weights needs it, nothing else does."""
+    try:
+        import slycot.exceptions
+    except ImportError:
+        raise SynthesisError(
+            "method 'hinf' needs slycot (GPL-2.0): pip install slycot, or use a method without weights"
+        ) from None
+    return slycot
+
+
 def solve(plant: StateSpace, gamma: float) -> StateSpace | None:
     """Return the central controller at `gamma`, or None where there is none.
 
@@ -130,10 +142,10 @@ def solve(plant: StateSpace, gamma: float) -> StateSpace | None:
     d[-1, -1] = 0.0
     inputs, outputs = plant.b.shape[1], len(plant.c)
     try:
-        result = slycot.sb10ad(
+        result = slicot().sb10ad(
             len(plant.a), inputs, outputs, 1, 1, gamma, plant.a, plant.b, plant.c, d, job=4
         )
-    except slycot.exceptions.SlycotArithmeticError as error:
+    except slicot().exceptions.SlycotArithmeticError as error:
         if error.info <= 4:
             raise SynthesisError(
                 "the H-infinity problem is singular (SB10AD: "

@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.optimize
 
 from piezo_control.design import certificate
-from piezo_control.design.hinf import hinf_controller
+from piezo_control.design.hinf import hinf_controller, slicot
 from piezo_control.design.problem import (
     DesignProblem,
     Prefilter,
@@ -51,6 +51,8 @@ def synthesize(problem: DesignProblem) -> Design:
     Raises SynthesisError, within seconds, for a problem that is singular or has no solution.
     """
     _need_resonance_below_nyquist(problem)
+    if problem.method == "hinf":
+        slicot()  # before a search that would take its absence for a problem without a solution
     is_open = not problem.weights if problem.method == "hinf" else problem.method != "given"
     if is_open:
         problem = tune(problem)
