@@ -171,7 +171,7 @@ FREE_PLAY = 5e-6  # m, so tips touch the object at an opening of 30 µm
 class Bench:
     """Two simulated fingers, the gripper, and a client; every wait is for a condition."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, state_timeout, speed):
         file = folder / "finger.yaml"
         nodes = {
             "cantilever": {
@@ -189,7 +189,8 @@ class Bench:
         for side in SIDES:
             self._start(side, "finger", folder, files, "-r", f"__ns:=/{side}")
         # A busy machine keeps a finger from talking for seconds.
-        self._start("gripper", "gripper", folder, [], "-p", "state_timeout:=4.0")
+        more = ("-p", f"state_timeout:={state_timeout}", "-p", f"speed:={speed}")
+        self._start("gripper", "gripper", folder, [], *more)
         self.node = rclpy.create_node("client")
         self.executor = EventsExecutor()
         self.executor.add_node(self.node)
@@ -252,10 +253,10 @@ class Bench:
 
 
 @contextmanager
-def started(folder):
+def started(folder, state_timeout=4.0, speed=DEFAULTS.speed):
     """Give a bench whose gripper has met its fingers, and see to it that all ends well."""
     rclpy.init()
-    bench = Bench(folder)
+    bench = Bench(folder, state_timeout, speed)
     try:
         bench.wait(lambda: len(bench.states) == 2 and bench.client.server_is_ready())
         bench.wait(lambda: all(s.phase == FingerState.RUNNING for s in bench.states.values()))

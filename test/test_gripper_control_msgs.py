@@ -53,7 +53,7 @@ class Client:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    with started(tmp_path_factory.mktemp("gripper")) as bench:
+    with started(tmp_path_factory.mktemp("gripper"), state_timeout=60.0, speed=1e-4) as bench:
         yield bench
 
 
@@ -64,7 +64,7 @@ def client(request, bench, tmp_path_factory):
     bench._start(
         "second", "gripper", tmp_path_factory.mktemp("second"), [],
         "-r", "__node:=second", "-r", "grip:=second/grip", "-p", "control_action:=GripperCommand",
-        "-p", "speed:=1e-4", "-p", "allow_stalling:=false",
+        "-p", "speed:=1e-4", "-p", "state_timeout:=60.0", "-p", "allow_stalling:=false",
     )  # fmt: skip
     client = Client(bench, request.param, "second")
     bench.wait(lambda: client.send(client.goal(40e-6)).accepted)  # it has met the fingers

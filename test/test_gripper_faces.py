@@ -125,7 +125,7 @@ class Faces:
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    with started(tmp_path_factory.mktemp("gripper")) as bench:
+    with started(tmp_path_factory.mktemp("gripper"), state_timeout=60.0, speed=1e-4) as bench:
         yield bench
 
 
@@ -159,12 +159,13 @@ def test_joint_states_have_opening_and_deflections(faces):
 
 
 def test_joint_states_tell_the_speed(faces):
-    faces.command(60e-6, velocity=[10e-6])  # 2 s
-    faces.bench.wait(lambda: faces.heard[-1].position[0] > 45e-6)
-    state = faces.heard[-1]
+    speed = 20e-6
+    faces.command(80e-6, velocity=[speed])  # 2 s
     # 0.1 s of samples with 10 nm of quantum and 5 nm of noise, two fingers
-    assert state.velocity[0] == pytest.approx(10e-6, abs=1e-6)
-    assert list(state.velocity[1:]) == pytest.approx([-5e-6, -5e-6], abs=0.5e-6)
+    faces.bench.wait(lambda: abs(faces.heard[-1].velocity[0] - speed) < 1e-6)
+    state = faces.heard[-1]
+    assert list(state.velocity[1:]) == pytest.approx([-speed / 2, -speed / 2], abs=1e-6)
+    assert 40e-6 < state.position[0] < 80e-6
 
 
 def test_a_command_out_of_reach_is_refused_with_the_reach(faces):
