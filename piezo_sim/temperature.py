@@ -19,10 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from piezo_control.identification.table import UNITS, TableError, read_table
+from piezo_control.identification.table import TableError, read_columns
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.safety import HIGHEST_DEGC, LOWEST_DEGC
 
+COLUMNS = {
+    "time": ("s", "ms", "us", "min"),
+    "temperature": ("degc",),
+}  # of a table, with their units
 PROFILES = ("constant", "step", "ramp", "sine", "spotlight", "random_walk", "replay")
 
 
@@ -139,44 +143,31 @@ def _walk(seed: int, period: float, time_constant: float, count: int) -> np.ndar
 def _recording(file: str, topic: str, changed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return time (s) and temperature (°C); `changed` tells one state of the file from another."""
     path = Path(file)
-    if path.is_dir():
-        time, values = _read_bag(path, topic)
-    else:
-        time, values = _read_text(path)
-    late = np.flatnonzero(np.diff(time) <= 0.0)
-    if late.size:
-        raise ParameterError(
-            f"{file}: column 'time', row {late[0] + 2}: {time[late[0] + 1]} s comes after "
-            f"{time[late[0]]} s, must increase"
-        )
-    return time, values
+    return _read_bag(path, topic) if path.is_dir() else _read_text(path)
 
 
 def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (s) and temperatures of a table; rows with an empty cell are left out."""
+    """Return times (s) and temperatures of a table; a few rows with an empty cell are left out."""
     try:
-        table = read_table(path)
-        columns = []
-        for quantity, units in (("time", ("s", "ms", "min")), ("temperature", ("degc",))):
-            place = table.find(quantity, None, units)
-            if place is None:
-                raise TableError(
-                    f"{path}: column '{quantity}' is missing; it has {', '.join(table.headers)}"
-                )
-            columns.append(table.numbers(place[0]) * UNITS[place[1]])
+        found = read_columns(path, COLUMNS, {}, ("temperature",))
     except TableError as error:
         raise ParameterError(str(error)) from None
-    time, values = columns
-    whole = ~np.isnan(time) & ~np.isnan(values)
-    if not whole.any():
+    time, values = found.values["time"], found.values["temperature"]
+    if not found.rows.size:
         raise ParameterError(f"{path}: has no rows")
-    wild = np.flatnonzero(~((values >= LOWEST_DEGC) & (values <= HIGHEST_DEGC)) & whole)
+    wild = np.flatnonzero(~((values >= LOWEST_DEGC) & (values <= HIGHEST_DEGC)))
     if wild.size:
         raise ParameterError(
-            f"{path}: column 'temperature', row {table.rows[wild[0]]} is {values[wild[0]]:g}, must be within "
+            f"{path}: column 'temperature', row {found.rows[wild[0]]} is {values[wild[0]]:g}, must be within "
             f"[{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C"
         )
-    return time[whole], values[whole]
+    late = np.flatnonzero(np.diff(time) <= 0.0)
+    if late.size:
+        raise ParameterError(
+            f"{path}: column 'time', row {found.rows[late[0] + 1]}: {time[late[0] + 1]} s comes after "
+            f"{time[late[0]]} s, must increase"
+        )
+    return time, values
 
 
 def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
@@ -202,4 +193,11 @@ def _read_bag(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     if bad or not values:
         what = f"message {bad[0]} is {values[bad[0]]} degC" if bad else "has no messages"
         raise ParameterError(f"{path}: topic '{topic}': {what}, must be finite")
-    return (np.array(nanoseconds) - nanoseconds[0]) * 1e-9, np.array(values)
+    time = (np.array(nanoseconds) - nanoseconds[0]) * 1e-9
+    late = np.flatnonzero(np.diff(time) <= 0.0)
+    if late.size:
+        raise ParameterError(
+            f"{path}: topic '{topic}': message {late[0] + 1} is stamped {time[late[0] + 1]} s after the first, the one "
+            f"before it {time[late[0]]} s; must increase"
+        )
+    return time, np.array(values)

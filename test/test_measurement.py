@@ -158,9 +158,22 @@ def test_unusable_bags_are_refused(tmp_path):
     voltage = np.arange(60.0)
     with pytest.raises(MeasurementError, match=str(tmp_path)):
         read_measurement(tmp_path)
-    path = write_bag(tmp_path / "lost", voltage[:40], voltage)
-    with pytest.raises(MeasurementError, match="column 'voltage', row 42 is nan"):
+    lost = np.where((voltage == 17) | (voltage == 18), np.nan, voltage)
+    path = write_bag(tmp_path / "nan", voltage, lost)
+    words = "4 of 60 samples .*2 in between, without deflection.*rosbag2_qos.yaml"
+    with pytest.raises(MeasurementError, match=words):
         read_measurement(path)
-    path = write_bag(tmp_path / "nan", voltage, np.where(voltage == 17, np.nan, voltage))
-    with pytest.raises(MeasurementError, match="column 'deflection', row 17 is nan"):
-        read_measurement(path)
+
+
+def test_few_lost_samples_of_a_bag_are_left_out_and_counted(tmp_path):
+    """A deflection that is lost, and the one two samples after a voltage that is: the rest stays paired."""
+    voltage = np.random.default_rng(1).uniform(-40.0, 40.0, 1000)
+    deflection = 5e-7 * np.concatenate((np.zeros(2), voltage))[:1000]
+    deflection[300] = np.nan
+    measurement = read_measurement(write_bag(tmp_path / "bag", voltage[:990], deflection))
+    kept = np.setdiff1d(np.arange(990), [300, 302])  # voltage 300 was left out with its deflection
+    np.testing.assert_array_equal(measurement.rows, kept)
+    np.testing.assert_allclose(measurement.deflection, 5e-7 * measurement.voltage, atol=1e-18)
+    assert "10 at the end, without voltage; 1 in between, without deflection" in (
+        measurement.description
+    )

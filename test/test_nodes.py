@@ -23,9 +23,10 @@ from rclpy.parameter import Parameter
 
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
-from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
+from piezo_control.recording.recording import read
 from piezo_control.touch import Touch, TouchParameters
 from piezo_gripper_msgs.msg import FingerState, Profile, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
@@ -142,6 +143,7 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
     expected = [law.step(10e-6, deflection) for deflection in deflections]
     with node("feedback", tmp_path, "feedback_paper.yaml"):
         commands = neighbour.listen(Sample, "command")
+        followed = neighbour.listen(Profile, "reference_followed_profile", FOLLOWED)
         reference = neighbour.publisher("reference", SETPOINT)
         deflection = neighbour.publisher("deflection")
         neighbour.tell("feedback", reference, sample(0, 10e-6))
@@ -155,9 +157,18 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
         neighbour.wait(lambda: commands[-1].number == 2)
         deflection.publish(sample(0, 0.0))  # a new run begins
         neighbour.wait(lambda: commands[-1].number == 0)
+        neighbour.tell("feedback", reference, sample(0, -3e-6))
+        last = sample(1, 1e-6)
+        last.header.stamp.nanosec = 100_000
+        deflection.publish(last)
+        neighbour.wait(lambda: len(followed) == 3 and commands[-1].number == 1)
+    commands.pop()
     repeats = len(commands) - 3
     assert [c.number for c in commands] == [0] * repeats + [1, 2, 0]
     assert [c.value for c in commands] == [expected[0]] * repeats + expected[1:] + expected[:1]
+    # What it follows is said once for each run and at each change, with the stamp of the first such sample.
+    assert [m.value.tolist() for m in followed] == [[10e-6], [10e-6], [-3e-6]]
+    assert [m.header.stamp.nanosec for m in followed] == [0, 0, 100_000]
     log = (tmp_path / "feedback.log").read_text()
     assert "'deflection' brought sample 3, expected 2" in log
     assert "'deflection' sample 2 is nan, must be finite" in log
@@ -395,6 +406,9 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
         for number in (1, 1, 2, 5):  # one twice, two missing
             deflection.publish(sample(number, number * 1e-6))
         neighbour.wait(lambda: sum(states[-1].recorded) == 4)
+        for number in (0, 1, 2):  # another run
+            deflection.publish(sample(number, -1e-6))
+        neighbour.wait(lambda: sum(states[-1].recorded) == 7)
         process = processes.running["recorder"]
         process.send_signal(stop)
         assert process.wait(TIMEOUT) == 0
@@ -402,7 +416,9 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
     assert states[-1].duplicates[row] >= 1 and states[-1].missing[row] == 2
     with (bag / "bag.mcap").open("rb") as stream:
         messages = [channel.topic for _, channel, _ in make_reader(stream).iter_messages()]
-    assert messages == ["/deflection"] * 4
+    assert messages == ["/deflection"] * 7
+    assert read(bag, run=0).number.tolist() == [0, 1, 2, 5]
+    assert read(bag, run=1).deflection.tolist() == [-1e-6] * 3
     assert (bag / "metadata.yaml").exists()
 
 

@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,8 @@ from rich.table import Table
 
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
-from piezo_control.identification import plots as plots
+from piezo_control.identification import checks, plots
+from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
 from piezo_control.identification.drift import identify_drift
 from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics
 from piezo_control.identification.hysteresis import (
@@ -36,7 +37,6 @@ from piezo_control.identification.hysteresis import (
     settled,
 )
 from piezo_control.identification.measurement import (
-    QUANTITIES,
     Measurement,
     MeasurementError,
     is_bag,
@@ -71,6 +71,8 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     measurement.need_varying("voltage", "deflection")
     first = settled(measurement) if arguments.skip is None else arguments.skip
     last = len(measurement.time)
+    if first < last:
+        checks.static(measurement.part(slice(first, last)))
     thresholds = arguments.thresholds or equal_thresholds(measurement, arguments.plays)
     dead_zones = arguments.dead_zones if arguments.model == "modified" else 0
     lag = arguments.lag
@@ -97,6 +99,10 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     model = fit(last)
     fits[f"all {last - first} samples, fitted"] = judge(model, slice(first, last))
     show(console, f"{arguments.model} hysteresis of {arguments.recording}", fits)
+    modelled = model.deflection(measurement.time, measurement.voltage)
+    fitted = slice(first, last)
+    if hum := checks.hum(measurement.part(fitted), (measurement.deflection - modelled)[fitted]):
+        console.print(f"{arguments.recording}: {hum}", soft_wrap=True)
     need_quality(str(arguments.recording), fits)
     console.print(
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
@@ -122,8 +128,7 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
             file,
         )
     picture = arguments.out / "hysteresis.png"
-    modelled = model.deflection(measurement.time, measurement.voltage)
-    plots.loops(measurement, modelled, slice(first, last), picture)
+    plots.loops(measurement, modelled, fitted, picture)
     return [
         path,
         update_cantilever(
@@ -152,7 +157,7 @@ def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify D(s) from a step or a sweep of the voltage; update cantilever.yaml."""
-    measurement = window(read(arguments.recording, arguments), arguments)
+    measurement = window(read(arguments.recording, arguments), arguments).bridged()
     measurement.need_varying("voltage")
     stored = arguments.out / "feedforward.yaml"
     drive = measurement.voltage
@@ -163,7 +168,7 @@ def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify the elastic constant from a step of the tip force; update cantilever.yaml."""
-    measurement = window(read(arguments.recording, arguments), arguments)
+    measurement = window(read(arguments.recording, arguments), arguments).bridged()
     measurement.need_varying("tip_force")
     if np.ptp(measurement.voltage) > 0.0:
         k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
@@ -223,7 +228,9 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify creep and thermal deflection from long recordings; update cantilever.yaml."""
     stored = arguments.out / "feedforward.yaml"
     operator = stored_hysteresis(stored) if stored.exists() else HysteresisParameters()
-    model = identify_drift([read(path, arguments) for path in arguments.recording], operator)
+    model = identify_drift(
+        [read(path, arguments).bridged() for path in arguments.recording], operator
+    )
     fits = {
         str(path): quality(curve[:, 1], curve[:, 2])
         for path, curve in zip(arguments.recording, model.fitted)
@@ -261,17 +268,19 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 def read(path: Path, arguments: argparse.Namespace) -> Measurement:
     """Read one recording with the columns and units of the command line."""
-    columns = {q: getattr(arguments, q) for q in QUANTITIES if getattr(arguments, q)}
-    rate = arguments.sample_rate
+    columns, sample_time = chosen_columns(arguments, QUANTITIES)
     measurement = read_measurement(
         path,
         columns,
-        1.0 / rate if rate else None,
+        sample_time,
         arguments.finger,
         arguments.run_number,
         arguments.sensor_delay,
     )
     print(f"{path}: {measurement.description}")
+    if arguments.reversed:
+        print(f"{path}: deflection read with its sign reversed")
+        measurement = replace(measurement, deflection=-measurement.deflection)
     return measurement
 
 
@@ -339,17 +348,9 @@ def write_json(path: Path, content: dict) -> Path:
 def parse() -> argparse.Namespace:
     """Return the command line's arguments."""
     reading = argparse.ArgumentParser(add_help=False)
-    text = reading.add_argument_group(
-        "tables",
-        "text, .mat, .npz or .parquet; COLUMN is a name, a part of one, or a number from 0",
-    )
-    for quantity, units in QUANTITIES.items():
-        text.add_argument(
-            f"--{quantity.replace('_', '-')}", metavar="COLUMN[:UNIT]",
-            help=f"column of the {quantity.replace('_', ' ')}; units {', '.join(units)}",
-        )  # fmt: skip
-    text.add_argument(
-        "--sample-rate", type=float, metavar="HZ", help="where no column has the time"
+    add_options(reading, QUANTITIES)
+    reading.add_argument(
+        "--reversed", action="store_true", help="the sensor says less where the finger bends more"
     )
     bag = reading.add_argument_group("bags")
     bag.add_argument("--finger", default="", metavar="NAMESPACE", help="which of several fingers")

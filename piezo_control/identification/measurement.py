@@ -17,23 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from piezo_control.identification.table import (
-    LARGEST_MISSING_SHARE,
-    UNITS,
-    TableError,
-    read_table,
-)
+from piezo_control.identification.columns import QUANTITIES
+from piezo_control.identification.table import LARGEST_MISSING_SHARE, TableError, read_columns
 from piezo_control.recording import recording
-from piezo_control.safety import LARGEST_DEFLECTION
 
 SHORTEST = 50  # samples
-QUANTITIES = {  # the units a column may have, the first of them where nothing says which
-    "time": ("s", "ms", "us", "min"),
-    "voltage": ("V", "mV", "kV"),
-    "deflection": ("m", "mm", "um", "nm"),
-    "temperature": ("degc",),
-    "tip_force": ("N", "mN", "uN"),
-}
+LARGEST_JITTER = 0.02  # of the sample time, standard deviation
 
 
 class MeasurementError(ValueError):
@@ -66,9 +55,18 @@ class Measurement:
             bad = [] if column is None else np.flatnonzero(~np.isfinite(column))
             if len(bad):
                 raise self.error(name, bad[0], "must be a finite number")
-        late = np.flatnonzero(np.diff(self.time) <= 0.0)
+        steps = np.diff(self.time)
+        late = np.flatnonzero(steps <= 0.0)
         if len(late):
-            raise self.error("time", late[0] + 1, f"not after {self.time[late[0]]:g} before it")
+            text = f"not after {self.time[late[0]]:g} before it"
+            if steps.min() < 0.0:
+                text += ": the time goes back; give one recording at a time, in its order"
+            else:
+                text += (
+                    f": {len(late):,} rows repeat a time; where the clock is coarse, --sample-rate "
+                    f"{1.0 / np.mean(steps):.5g} takes its place"
+                )
+            raise self.error("time", late[0] + 1, text)
 
     def error(self, column: str, sample: int, text: str) -> MeasurementError:
         """Return the error about one entry, to be raised."""
@@ -103,6 +101,48 @@ class Measurement:
             raise self.error(
                 "time", i + 1, f"{steps[i]:g} s after the row before, must be {self.sample_time:g}"
             )
+
+    def clock(self) -> list[str]:
+        """Say what is odd about the time: gaps, and steps that vary.
+
+        Raises MeasurementError at the first gap when more is missing than may be.
+        """
+        steps = np.diff(self.time)
+        gaps = np.flatnonzero(steps > 1.5 * self.sample_time)
+        missing = int(np.sum(np.round(steps[gaps] / self.sample_time) - 1))
+        said = []
+        if missing:
+            lost = f"{missing:,} rows are missing in {gaps.size} gaps"
+            if missing > LARGEST_MISSING_SHARE * (steps.size + missing):
+                text = f"{steps[gaps[0]]:.4g} s after the row before, rows come every {self.sample_time:.4g} s: {lost}"
+                raise self.error("time", int(gaps[0]) + 1, f"{text}; use a part without them")
+            said.append(f"{lost}, the first before row {self.rows[gaps[0] + 1]}")
+        even = np.delete(steps, gaps) / self.sample_time
+        if np.std(even) > LARGEST_JITTER:
+            worst = int(
+                np.argmax(
+                    np.abs(np.where(steps > 1.5 * self.sample_time, 0.0, steps - self.sample_time))
+                )
+            )
+            said.append(
+                f"the time between rows varies by {100.0 * np.std(even):.2g} %, most before row {self.rows[worst + 1]}; "
+                f"where the instrument samples evenly, give --sample-rate {1.0 / np.mean(even * self.sample_time):.5g}"
+            )
+        return said
+
+    def bridged(self) -> Measurement:
+        """Return the measurement with straight lines across what few rows are missing; as it is, if none are."""
+        place = np.round((self.time - self.time[0]) / self.sample_time)
+        if place[-1] + 1 == len(place) or np.any(np.diff(place) < 1.0):
+            return self
+        whole = np.arange(place[-1] + 1)
+
+        def filled(values: NDArray | None) -> NDArray | None:
+            return None if values is None else np.interp(whole, place, values)
+
+        columns: dict[str, Any] = {name: filled(getattr(self, name)) for name in QUANTITIES}
+        rows = self.rows[np.searchsorted(place, whole)]
+        return replace(self, **columns, rows=rows)
 
     def part(self, samples: slice) -> Measurement:
         """Return the measurement of these samples only."""
@@ -148,47 +188,22 @@ def read_text(
         micrometres; ``"probe:um"`` the column of that name, or the only one with 'probe' in its name. A
         quantity not mentioned is looked for under its own name. A unit in the file need not be given.
     sample_time : float, optional
-        Time between rows (s) of a file without time column.
+        Time between rows (s); it takes the place of a column with the time.
 
     Rows in which a cell that is needed is empty are left out, if they are few.
     """
     try:
-        table = read_table(path)
-        found = {q: table.find(q, columns.get(q), units) for q, units in QUANTITIES.items()}
-        for quantity in ("voltage", "deflection"):
-            if found[quantity] is None:
-                raise MeasurementError(
-                    f"{path}: no column for '{quantity}'; the file has {', '.join(table.headers)}"
-                )
-        if found["time"] is None and sample_time is None:
-            raise MeasurementError(f"{path}: no column for 'time' and no sample time given")
-        places = {quantity: place for quantity, place in found.items() if place}
-        values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
+        found = read_columns(path, QUANTITIES, columns, ("voltage", "deflection"), sample_time)
     except TableError as error:
         raise MeasurementError(str(error)) from None
-    if "time" not in values:
-        values["time"] = sample_time * np.arange(len(table.rows))
-    empty = np.any([np.isnan(column) for column in values.values()], axis=0)
-    if empty.mean() > LARGEST_MISSING_SHARE:
-        raise MeasurementError(
-            f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
-            f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
-        )
-    stroke = np.ptp(values["deflection"][~empty])
-    if LARGEST_DEFLECTION < stroke < np.inf:
-        raise MeasurementError(
-            f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
-            "unit, as in --deflection COLUMN:um"
-        )
-    read = ", ".join(f"{q} = column '{table.headers[i]}' [{u}]" for q, (i, u) in places.items())
-    left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
-    columns_found = {q: values[q][~empty] if q in values else None for q in QUANTITIES}
-    return Measurement(
+    measurement = Measurement(
         source=str(path),
-        rows=table.rows[~empty],
-        description=f"read {(~empty).sum():,} rows {table.form}: {read}{left_out}",
-        **columns_found,
+        rows=found.rows,
+        description=found.description,
+        **{quantity: found.values.get(quantity) for quantity in QUANTITIES},
     )
+    odd = measurement.clock()
+    return replace(measurement, description="; ".join([found.description, *odd]))
 
 
 def read_bag(
@@ -202,32 +217,40 @@ def read_bag(
     finger : namespace of the finger, needed when the bag has several
     run : which run, from 0, of a bag in which the sample numbers start again
     sensor_delay : age of a deflection (samples) when the cantilever publishes it
+
+    Samples that were lost, or whose voltage was, are left out, if they are few.
     """
     try:
-        recorded = recording.read(path, finger, run)
+        recorded, left_out = recording.read(path, finger, run).complete()
     except recording.BagError as error:
         raise MeasurementError(str(error)) from None
-    before = 1 + sensor_delay
+    number = recorded.number
+    wanted = number - 1 - sensor_delay
+    index = np.searchsorted(number, np.maximum(wanted, 0)).clip(max=number.size - 1)
+    paired = (number[index] == wanted) | (wanted < 0)
+    if number[0] > 0:
+        paired &= wanted >= 0
+    total = number[-1] - number[0] + 1 - (0 if number[0] == 0 else 1 + sensor_delay)
+    if paired.sum() < (1.0 - LARGEST_MISSING_SHARE) * total:
+        raise MeasurementError(
+            f"{path}: {total - paired.sum():,} of {total:,} samples have no deflection or no voltage before them "
+            f"({left_out}), at most {LARGEST_MISSING_SHARE:.0%} may; record with the recorder node, or with "
+            "`ros2 bag record --qos-profile-overrides-path params/rosbag2_qos.yaml`"
+        )
 
-    def earlier(values: NDArray, at_start: float) -> NDArray:
-        return np.concatenate((np.full(before, at_start), values))[: len(values)]
-
-    def since_sent(values: NDArray, until_then: float | None = None) -> NDArray | None:
-        sent = np.flatnonzero(~np.isnan(values))
-        if not len(sent):
+    def earlier(values: NDArray, at_start: float) -> NDArray | None:
+        if np.isnan(values).all():
             return None
-        start = values[sent[0]] if until_then is None else until_then
-        return earlier(np.concatenate((np.full(sent[0], start), values[sent[0] :])), start)
+        return np.where(wanted < 0, at_start, values[index])[paired]
 
-    measurement = Measurement(
+    return Measurement(
         str(path),
-        (recorded.number - recorded.number[0]) * recorded.sample_time,
+        ((number - number[0]) * recorded.sample_time)[paired],
         earlier(recorded.voltage, 0.0),
-        recorded.deflection,
-        since_sent(recorded.temperature),
-        since_sent(recorded.tip_force, until_then=0.0),
-        recorded.number,
-        f"read {recorded.number.size:,} samples of a bag, one every {recorded.sample_time:g} s",
+        recorded.deflection[paired],
+        earlier(recorded.temperature, recorded.temperature[0]),
+        earlier(recorded.tip_force, recorded.tip_force[0]),
+        number[paired],
+        f"read {paired.sum():,} samples of a bag, one every {recorded.sample_time:g} s"
+        + (f"; {left_out}" if left_out else ""),
     )
-    measurement.need_even_sampling()
-    return measurement

@@ -11,7 +11,7 @@ from __future__ import annotations
 import codecs
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+
+from piezo_control.safety import LARGEST_DEFLECTION
 
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0,
@@ -145,6 +147,79 @@ class Table:
                 f"'{text.iloc[row]}', must be a finite number"
             )
         return values
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Quantities of a table in SI units, each a 1-D array as long as `rows`, the numbers of the lines."""
+
+    values: dict[str, NDArray[np.float64]]
+    rows: NDArray[np.int64]
+    description: str  # what was read, for people
+
+
+def read_columns(
+    path: str | Path,
+    quantities: Mapping[str, tuple[str, ...]],
+    columns: Mapping[str, str],
+    needed: Sequence[str],
+    sample_time: float | None = None,
+) -> Columns:
+    """Read the columns of a table that hold known quantities.
+
+    Parameters
+    ----------
+    path : path of the file
+    quantities : the units that each may have, the first of them where nothing says which; time among them
+    columns : where to find a quantity that has another name, see :meth:`Table.find`
+    needed : quantities that have to be there, beside the time
+    sample_time : time between rows (s); it takes the place of the column with the time
+
+    Rows in which a cell that is needed is empty are left out, if they are few. Raises TableError, naming file,
+    column and row.
+    """
+    table = read_table(path)
+    found = {q: table.find(q, columns.get(q), units) for q, units in quantities.items()}
+    if sample_time is not None:
+        found["time"] = None
+    for quantity in needed:
+        if found[quantity] is None:
+            raise TableError(
+                f"{path}: no column for '{quantity}'; the file has {', '.join(table.headers)}"
+            )
+    if found["time"] is None and sample_time is None:
+        raise TableError(
+            f"{path}: no column for 'time' and no sample time given; the file has {', '.join(table.headers)}"
+        )
+    places = {quantity: place for quantity, place in found.items() if place}
+    values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
+    if sample_time is not None:
+        values["time"] = sample_time * np.arange(len(table.rows))
+    empty = np.any([np.isnan(column) for column in values.values()], axis=0)
+    if empty.sum() > LARGEST_MISSING_SHARE * empty.size:
+        raise TableError(
+            f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
+            f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
+        )
+    stroke = (
+        float(np.ptp(values["deflection"][~empty]))
+        if "deflection" in values and not empty.all()
+        else 0.0
+    )
+    if LARGEST_DEFLECTION < stroke < np.inf:
+        raise TableError(
+            f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
+            "unit, as in --deflection COLUMN:um"
+        )
+    words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit) in places.items()]
+    if sample_time is not None:
+        words.insert(0, f"time = rows {sample_time:g} s apart")
+    left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
+    return Columns(
+        {quantity: column[~empty] for quantity, column in values.items()},
+        table.rows[~empty],
+        f"read {(~empty).sum():,} rows {table.form}: {', '.join(words)}{left_out}",
+    )
 
 
 def read_table(path: str | Path) -> Table:

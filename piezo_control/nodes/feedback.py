@@ -4,9 +4,11 @@
 in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m),
      reference_waveform (Waveform, m), expected (Sample, m) with `force_control`: the deflection of a tip that
      nobody pushes
-out: command (Sample, m), push (Sample, N) with `force_control`: the force of an object, as estimated
+out: command (Sample, m), reference_followed_profile (Profile, m), reference_followed_waveform (Waveform, m),
+     push (Sample, N) with `force_control`: the force of an object, as estimated
 
-The newest of set-point, profile and waveform is followed. With `controller: none` the reference passes through:
+The newest of set-point, profile and waveform is followed, and what it is is said with the stamp of the first
+sample at which it is. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
 loop runs, with the command where it was. With `force_control`, in place of the controller, the loop follows the
 reference as long as the tip pushes with no more than the profile's `max_force` and its own `touch.force_limit`,
@@ -63,7 +65,7 @@ class FeedbackNode(BlockNode):
         self._take_file()
         self.restart_law()
         self.reference = ProfileInput(
-            self, "reference", self.parameters.sample_time, LARGEST_DEFLECTION
+            self, "reference", self.parameters.sample_time, LARGEST_DEFLECTION, says=True
         )
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
@@ -218,6 +220,7 @@ class FeedbackNode(BlockNode):
         self.deflection = sample.value
         if self.parameters.mode == "free_running" and not self._is_in_time():
             return False
+        self.reference.say(sample.header)
         p, reference = self.parameters, self.reference[sample.number]
         answer.by_controller = self._has_a_rate()
         if not p.force_control:

@@ -128,8 +128,9 @@ class ServoNodeParameters(ServoParameters):
 
 
 RECORDED = (
-    "reference", "reference_profile", "reference_waveform", "deflection", "command", "voltage", "samples",
-    "temperature", "tip_force", "tip_force_profile", "tip_force_waveform", "push", "state",
+    "reference", "reference_profile", "reference_waveform", "reference_followed_profile",
+    "reference_followed_waveform", "deflection", "command", "voltage", "samples", "temperature", "tip_force",
+    "tip_force_profile", "tip_force_waveform", "push", "state",
 )  # fmt: skip
 """Topics of a finger."""
 

@@ -7,8 +7,9 @@ import math
 from collections.abc import Callable
 
 from rclpy.node import Node
+from std_msgs.msg import Header
 
-from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SETPOINT
 from piezo_control.profile import Profile, SampledSignal, Signal
 from piezo_control.safety import LARGEST_FORCE
 from piezo_control.waveform import SHAPES, Waveform
@@ -37,7 +38,8 @@ class ProfileInput:
     """Subscribes TOPIC (Sample), TOPIC_profile and TOPIC_waveform; ``input[k]`` is the value at sample k.
 
     A profile is kept for who joins later; a waveform moves the fingers that are there when it is sent.
-    `on_change()` is called with every new signal.
+    `on_change()` is called with every new signal. Where it `says` so, TOPIC_followed_profile and
+    TOPIC_followed_waveform are what is followed.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class ProfileInput:
         sample_time: float,
         largest: float,
         on_change: Callable[[], None] = lambda: None,
+        says: bool = False,
     ) -> None:
         self._on_change = on_change
         self._node = node
@@ -55,6 +58,14 @@ class ProfileInput:
         self.max_force = math.inf
         """Force (N) that the sender allows; infinite where it says nothing."""
         self._sampled = SampledSignal(Profile([0.0], [0.0]), sample_time)
+        self._is_new = True
+        if says:
+            self._profiles = node.create_publisher(
+                ProfileMessage, f"{topic}_followed_profile", FOLLOWED
+            )
+            self._waveforms = node.create_publisher(
+                WaveformMessage, f"{topic}_followed_waveform", FOLLOWED
+            )
         node.create_subscription(Sample, topic, self._on_value, SETPOINT)
         node.create_subscription(ProfileMessage, f"{topic}_profile", self._on_profile, LATCHED)
         node.create_subscription(WaveformMessage, f"{topic}_waveform", self._on_waveform, SETPOINT)
@@ -68,8 +79,24 @@ class ProfileInput:
         return self._sampled.signal
 
     def restart(self, sample_time: float) -> None:
-        """Read the same signal at another sample time."""
+        """Read the same signal in another run, at its sample time."""
         self._sampled = SampledSignal(self._sampled.signal, sample_time)
+        self._is_new = True
+
+    def say(self, header: Header) -> None:
+        """Publish what is followed from the sample with this header on, if it is new or the run is."""
+        if not self._is_new:
+            return
+        self._is_new = False
+        signal = self.signal
+        if isinstance(signal, Waveform):
+            waveform = waveform_message(signal)
+            waveform.header = header
+            self._waveforms.publish(waveform)
+        elif isinstance(signal, Profile):
+            profile = to_message(signal)
+            profile.header = header
+            self._profiles.publish(profile)
 
     def _on_value(self, sample: Sample) -> None:
         self._take(self._topic, lambda: Profile([0.0], [sample.value]))
@@ -110,4 +137,5 @@ class ProfileInput:
             return
         self._sampled = SampledSignal(signal, self._sampled.sample_time)
         self.max_force = max_force or math.inf
+        self._is_new = True
         self._on_change()

@@ -22,6 +22,13 @@ FAULTS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
+# What is followed, and from which sample on: every change counts, also for those who join later.
+FOLLOWED = QoSProfile(
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
 # Profiles and states: the newest is kept for those who join later.
 LATCHED = QoSProfile(
     depth=1,

@@ -7,7 +7,8 @@ out: recorder_state (RecorderState)
 A recording begins at activation and is finished, readable, at deactivation, shutdown, SIGINT and
 SIGTERM. Numbered samples are written once each, whatever the transport repeats; numbers never seen are
 counted as missing. A message's time in the bag is its own stamp, so a lock-step run replays at the
-finger's speed; one without a stamp, as of `ros2 topic pub`, has that of the newest sample. A run that starts again at sample 0 goes on in the same bag.
+finger's speed; one without a stamp, as of `ros2 topic pub`, has that of the newest sample. A run that starts
+again at sample 0 goes on in the same bag, behind the one before.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from rosbags.interfaces import Connection
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import RecorderParameters
-from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE
 from piezo_control.recording.recording import (
     BLOCK_TYPE,
     PROFILE_TYPE,
@@ -43,6 +44,8 @@ FINGER = {
     "reference": (SAMPLE_TYPE, SAMPLE),
     "reference_profile": (PROFILE_TYPE, LATCHED),
     "reference_waveform": (WAVEFORM_TYPE, SAMPLE),
+    "reference_followed_profile": (PROFILE_TYPE, FOLLOWED),
+    "reference_followed_waveform": (WAVEFORM_TYPE, FOLLOWED),
     "deflection": (SAMPLE_TYPE, SAMPLE),
     "command": (SAMPLE_TYPE, SAMPLE),
     "voltage": (SAMPLE_TYPE, SAMPLE),
@@ -125,6 +128,7 @@ class RecorderNode(FingerNode):
         self.tracks = {}
         self.newest = 0
         self.has_blocks = False
+        self.begin = 0
         self.unstamped: list[tuple[str, bytes]] = []
         for topic, (name, qos) in self.types.items():
             if name not in writer.typestore.types:
@@ -185,6 +189,10 @@ class RecorderNode(FingerNode):
         if track.has_header:
             seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
             stamp = seconds * 10**9 + nanoseconds
+            if track.is_numbered and not self._is_new(track, sample_number(data), stamp):
+                return
+            if stamp or track.is_numbered or track.is_block or track.is_stamped:
+                stamp += self.begin
             if track.is_numbered or track.is_block:
                 self._tell_time(max(stamp, self.newest, 1))
             elif not stamp and not track.is_stamped:  # a temperature's 0 is the instant of sample 0
@@ -194,8 +202,6 @@ class RecorderNode(FingerNode):
                 stamp = self.newest
         else:
             stamp = self.get_clock().now().nanoseconds
-        if track.is_numbered and not self._is_new(track, sample_number(data)):
-            return
         if track.is_stamped and stamp <= track.last_stamp:
             track.duplicates += 1
             return
@@ -215,7 +221,7 @@ class RecorderNode(FingerNode):
         while self.unstamped:
             self._write(*self.unstamped.pop(0))
 
-    def _is_new(self, track: Track, number: int) -> bool:
+    def _is_new(self, track: Track, number: int, stamp: int) -> bool:
         """Count sample `number` of a topic and say whether it has not been written yet."""
         kind = track.sequence.classify(number)
         if kind == STRAY and number >= track.sequence.next:
@@ -231,6 +237,8 @@ class RecorderNode(FingerNode):
             for other in self.tracks.values():
                 other.sequence = Sequence(gaps=True)
                 other.last_stamp = -1
+            # In simulated time the new run begins at 0 again; in the bag it comes after the one before.
+            self.begin = self.newest if stamp < self.newest else 0
         if not self.has_blocks:  # beside blocks, single samples are a selection
             track.missing += number - max(track.sequence.next, 0)
         track.sequence.count(number)

@@ -40,6 +40,7 @@ class Bag:
     typestore: Typestore
     topics: dict[str, Topic]
     damage: str = ""
+    _messages: dict[str, list[Any]] = field(default_factory=dict, init=False, repr=False)
 
     def messages(self, topic: str, kind: str) -> list[Any]:
         """Return the messages of `topic`, which have to be of type `kind`; none for no such topic.
@@ -49,12 +50,16 @@ class Bag:
         found = self.topics.get(topic, Topic(kind))
         if found.type != kind:
             raise BagError(f"{self.path}: topic '{topic}' is of type {found.type}, must be {kind}")
+        if topic in self._messages:
+            return self._messages[topic]
         try:
-            return [self.typestore.deserialize_cdr(data, kind) for data in found.data]
+            messages = [self.typestore.deserialize_cdr(data, kind) for data in found.data]
         except Exception as error:  # of the library that takes the bytes apart, whatever they are
             raise BagError(
                 f"{self.path}: topic '{topic}' cannot be read as {kind}: {error}"
             ) from None
+        self._messages[topic] = messages  # taking the bytes apart costs more than all else
+        return messages
 
     def content(self) -> str:
         """Return topics with their numbers of messages and types, for people."""

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piezo_control.profile import Profile, Signal
-from piezo_control.recording.reader import Bag, BagError, open_bag
+from piezo_control.recording.reader import Bag, BagError, Topic, open_bag
 from piezo_control.waveform import Waveform
 
 __all__ = ["BagError", "Recording", "read"]
@@ -22,6 +23,7 @@ WAVEFORM_TYPE = "piezo_gripper_msgs/msg/Waveform"
 BLOCK_TYPE = "piezo_gripper_msgs/msg/SampleBlock"
 TEMPERATURE_TYPE = "sensor_msgs/msg/Temperature"
 LINEAR = 1  # Profile.interpolation: straight lines
+LOOP = ("reference", "deflection", "command", "voltage")
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,49 @@ class Recording:
         """Time from sample to sample in s: the median, in whole nanoseconds."""
         return _period(self.time, self.number)
 
+    def part(self, samples: slice | NDArray) -> Recording:
+        """Return the recording of these samples only."""
+        return Recording(**{f.name: getattr(self, f.name)[samples] for f in fields(self)})
+
+    def complete(self) -> tuple[Recording, str]:
+        """Return the samples at which every signal of the loop is known, and what is left out for that, in words.
+
+        A signal that was not recorded at all is no reason to leave out a sample. Before the first one that is
+        known, the temperature was the same and the tip force 0.
+        """
+        lost = {n: np.isnan(getattr(self, n)) for n in LOOP if np.isfinite(getattr(self, n)).any()}
+        whole = ~np.any(list(lost.values()), axis=0)
+        known = np.flatnonzero(whole)
+        if not known.size:
+            raise BagError(f"no sample has all of {', '.join(lost)}")
+        places = {
+            "at the beginning": slice(0, known[0]),
+            "at the end": slice(known[-1] + 1, None),
+            "in between": slice(known[0], known[-1] + 1),
+        }
+        left_out = []
+        for place, samples in places.items():
+            count = int(np.sum(~whole[samples]))
+            missing = [name for name in lost if lost[name][samples].any()]
+            if count:
+                left_out.append(f"{count:,} {place}, without {' or '.join(missing)}")
+        words = [f"left out: {'; '.join(left_out)}"] if left_out else []
+        if self.number[0] > 0:
+            words.append(f"the bag begins at sample {self.number[0]:,}")
+        step = int(np.median(np.diff(self.number))) if self.number.size > 1 else 1
+        absent = int((self.number[-1] - self.number[0]) // step + 1 - self.number.size)
+        if absent > 0:
+            words.append(
+                f"{absent:,} of {self.number.size + absent:,} samples were not recorded, the first is "
+                f"{self.number[np.argmax(np.diff(self.number) > step)] + step:,}"
+            )
+        kept = self.part(whole)
+        return replace(
+            kept,
+            temperature=_from_the_beginning(kept.temperature),
+            tip_force=_from_the_beginning(kept.tip_force, 0.0),
+        ), "; ".join(words)
+
 
 def read(
     path: str | Path, finger: str = "", run: int | None = None, partial: bool = False
@@ -56,8 +101,8 @@ def read(
     """Read a run from a rosbag2 folder (MCAP or SQLite), or from one such storage file.
 
     Samples are brought in line by their numbers; those that a topic does not have are NaN, repeated
-    ones count once. References and tip forces are evaluated from their profile or waveform, or held from
-    set-point to set-point; temperatures are held from stamp to stamp.
+    ones count once. The reference is the one that was followed; tip forces are evaluated from their profile or
+    waveform, or held from set-point to set-point; temperatures are held from stamp to stamp.
 
     Parameters
     ----------
@@ -83,12 +128,13 @@ def read(
             f"{path}: {bag.damage}; could be read: {bag.content()}; to use that, ask for a partial reading"
         )
     prefix = _prefix(bag, finger)
-    signals = _from_blocks(bag, prefix, run) or _from_samples(bag, prefix, run)
+    bag = _of_run(bag, prefix, run)
+    signals = _from_blocks(bag, prefix) or _from_samples(bag, prefix)
     number, stamps, received = (signals.pop(name) for name in ("number", "stamps", "received"))
     elapsed = number * _period((stamps - stamps[0]) * 1e-9, number)
-    for name in ("reference", "tip_force"):
-        if name not in signals:
-            signals[name] = _signal(bag, prefix + name, received, elapsed)
+    if "reference" not in signals:
+        signals["reference"] = _reference(bag, prefix, stamps, received, elapsed)
+    signals["tip_force"] = _signal(bag, f"{prefix}tip_force", received, elapsed)
     warmth = bag.messages(f"{prefix}temperature", TEMPERATURE_TYPE)
     recording = Recording(
         number=number,
@@ -103,10 +149,19 @@ def read(
 
 def _without_ragged_end(recording: Recording) -> Recording:
     """Cut off the last samples, for which some of the signals that were recorded are missing."""
-    signals = {f.name: getattr(recording, f.name) for f in fields(recording)}
-    present = [np.flatnonzero(np.isfinite(signal)) for signal in signals.values()]
-    end = min(samples[-1] + 1 for samples in present if samples.size)
-    return Recording(**{name: signal[:end] for name, signal in signals.items()})
+    signals = [getattr(recording, f.name) for f in fields(recording)]
+    present = [np.flatnonzero(np.isfinite(signal)) for signal in signals]
+    return recording.part(slice(min(samples[-1] + 1 for samples in present if samples.size)))
+
+
+def _from_the_beginning(values: NDArray, before: float | None = None) -> NDArray[np.float64]:
+    """Return `values` with `before`, or their first known one, where they are not known yet."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not known.size:
+        return values
+    filled = values.copy()
+    filled[: known[0]] = values[known[0]] if before is None else before
+    return filled
 
 
 def _prefix(bag: Bag, finger: str) -> str:
@@ -126,13 +181,45 @@ def _prefix(bag: Bag, finger: str) -> str:
     return found[0]
 
 
-def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
+def _of_run(bag: Bag, prefix: str, run: int | None) -> Bag:
+    """Return what a bag holds of one run: where the samples' numbers go back, another one begins.
+
+    What was sent before a run and is numbered by none, a reference, a temperature, may last into it.
+    """
+    name, kind = f"{prefix}samples", BLOCK_TYPE
+    if not bag.messages(name, kind):
+        name, kind = f"{prefix}deflection", SAMPLE_TYPE
+    number = np.array([m.number for m in bag.messages(name, kind)])
+    begins = [0, *np.flatnonzero(np.diff(number) < 0) + 1]
+    if run is None and len(begins) > 1 or run is not None and not 0 <= run < len(begins):
+        raise BagError(
+            f"{bag.path}: topic '{name}' has {len(begins)} runs (numbered from 0), and run {run} was asked for"
+        )
+    if len(begins) == 1:
+        return bag
+    edges = [*(bag.topics[name].stamps[i] for i in begins), np.inf]
+    begin, until = edges[run or 0], edges[(run or 0) + 1]
+    numbered = {prefix + signal for signal in ("samples", *LOOP[1:])}
+    numbered |= {f"{prefix}reference_followed_{form}" for form in ("profile", "waveform")}
+    topics = {}
+    for name, topic in bag.topics.items():
+        kept = [
+            i
+            for i, s in enumerate(topic.stamps)
+            if s < until and (s >= begin or name not in numbered)
+        ]
+        topics[name] = Topic(
+            topic.type, [topic.stamps[i] for i in kept], [topic.data[i] for i in kept]
+        )
+    return replace(bag, topics=topics)
+
+
+def _from_blocks(bag: Bag, prefix: str) -> dict[str, NDArray]:
     """Return number, stamps (ns) and signals of a loop that was recorded in blocks; nothing if it was not."""
     topic = f"{prefix}samples"
     blocks = bag.messages(topic, BLOCK_TYPE)
     if not blocks:
         return {}
-    blocks = blocks[_choose_run(bag, topic, blocks, run)]
     counts = [np.arange(len(block.deflection)) for block in blocks]
     number = np.concatenate([block.number + n for block, n in zip(blocks, counts)])
     stamps = [
@@ -148,12 +235,11 @@ def _from_blocks(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
     return {"number": number, **{name: signal[first] for name, signal in signals.items()}}
 
 
-def _from_samples(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
+def _from_samples(bag: Bag, prefix: str) -> dict[str, NDArray]:
     """Return number, stamps (ns) and signals of a loop that was recorded sample by sample."""
     topic = f"{prefix}deflection"
-    messages = bag.messages(topic, SAMPLE_TYPE)
-    chosen = _choose_run(bag, topic, messages, run)
-    deflection, received = messages[chosen], np.array(bag.topics[topic].stamps[chosen])
+    deflection = bag.messages(topic, SAMPLE_TYPE)
+    received = np.array(bag.topics[topic].stamps)
     number, first = np.unique([m.number for m in deflection], return_index=True)
     stamps = np.array([_nanoseconds(deflection[i].header.stamp) for i in first])
     commands, voltages = (bag.messages(prefix + n, SAMPLE_TYPE) for n in ("command", "voltage"))
@@ -168,18 +254,6 @@ def _from_samples(bag: Bag, prefix: str, run: int | None) -> dict[str, NDArray]:
             *(_align(number, answers, stamps, "limited") for answers in (commands, voltages))
         ),
     }
-
-
-def _choose_run(bag: Bag, topic: str, messages: list[Any], run: int | None) -> slice:
-    """Return which messages are those of one run; where numbers go back, another one begins."""
-    number = np.array([m.number for m in messages])
-    begins = [0, *np.flatnonzero(np.diff(number) < 0) + 1, number.size]
-    count = len(begins) - 1
-    if run is None and count > 1 or run is not None and not 0 <= run < count:
-        raise BagError(
-            f"{bag.path}: topic '{topic}' has {count} runs (numbered from 0), and run {run} was asked for"
-        )
-    return slice(int(begins[run or 0]), int(begins[(run or 0) + 1]))
 
 
 def _period(time: NDArray, number: NDArray) -> float:
@@ -203,27 +277,51 @@ def _align(number: NDArray, samples: list[Any], stamps: NDArray, field: str) -> 
     return np.array([values.get(n, np.nan) for n in number.tolist()], float)
 
 
+def _reference(
+    bag: Bag, prefix: str, stamps: NDArray, received: NDArray, elapsed: NDArray
+) -> NDArray[np.float64]:
+    """Return the reference by what the feedback said it follows and from which sample on.
+
+    Where it said nothing, by what was sent to it and when that came.
+    """
+    values = np.full(elapsed.shape, np.nan)
+    said = _sent(bag, f"{prefix}reference_followed")
+    for _, stamp, signal in sorted(said, key=lambda one: one[1]):
+        first = int(np.searchsorted(stamps, stamp))
+        values[first:] = signal.at(elapsed[first:])
+    return np.where(np.isnan(values), _signal(bag, f"{prefix}reference", received, elapsed), values)
+
+
+def _sent(bag: Bag, name: str) -> list[tuple[int, int, Signal]]:
+    """Return the bag's stamp, the message's own (ns) and the signal of all profiles, waveforms and set-points."""
+    kinds: dict[str, tuple[str, Callable[[Any], Signal]]] = {
+        f"{name}_profile": (PROFILE_TYPE, lambda m: Profile(m.time, m.value, m.interpolation == LINEAR)),
+        f"{name}_waveform": (WAVEFORM_TYPE, Waveform.of),
+        name: (SAMPLE_TYPE, lambda m: Profile([0.0], [m.value])),
+    }  # fmt: skip
+    return [
+        (came, _nanoseconds(m.header.stamp), signal(m))
+        for topic, (kind, signal) in kinds.items()
+        if topic in bag.topics
+        for came, m in zip(bag.topics[topic].stamps, bag.messages(topic, kind))
+    ]
+
+
 def _signal(bag: Bag, name: str, received: NDArray, elapsed: NDArray) -> NDArray[np.float64]:
     """Evaluate a signal that came as profiles, waveforms (over the time `elapsed`) and set-points.
 
-    The newest counts, and each is in force from when it came, by the bag's own stamps, as are the samples (`received`, ns). A
-    profile that came first says what was before it, too.
+    The newest counts, and each is in force from when it came, by the bag's own stamps, as are the samples
+    (`received`, ns). A profile that came first says what was before it, too.
     """
-    came: list[tuple[int, bool, Signal]] = []
-    types = {f"{name}_profile": PROFILE_TYPE, f"{name}_waveform": WAVEFORM_TYPE, name: SAMPLE_TYPE}
-    for topic, kind in types.items():
-        messages = bag.messages(topic, kind)
-        for m, instant in zip(messages, bag.topics[topic].stamps if messages else ()):
-            if kind == PROFILE_TYPE:
-                came.append((instant, True, Profile(m.time, m.value, m.interpolation == LINEAR)))
-            elif kind == WAVEFORM_TYPE:
-                came.append((instant, False, Waveform.of(m)))
-            else:
-                came.append((instant, False, Profile([0.0], [m.value])))
-    came.sort(key=lambda one: one[0])
+    came = sorted(_sent(bag, name), key=lambda one: one[0])
     values = np.full(elapsed.shape, np.nan)
-    for i, (instant, is_profile, signal) in enumerate(came):
-        first = 0 if i == 0 and is_profile else int(np.searchsorted(received, instant))
+    for i, (instant, _, signal) in enumerate(came):
+        is_there = (
+            i == 0
+            and f"{name}_profile" in bag.topics
+            and (instant in bag.topics[f"{name}_profile"].stamps)
+        )
+        first = 0 if is_there else int(np.searchsorted(received, instant))
         values[first:] = signal.at(elapsed[first:])
     return values
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,8 @@ QUANTITIES = {
 AVERAGE = 0.01  # s of the moving average over a deflection that follows a temperature
 CREEP_BEGIN = 1.0  # s after the step from which on slow motion counts as creep
 CREEP_AVERAGE = 0.5  # s
+SHORTEST_HOLD = 10  # samples for which a reference keeps a value, to be one that it went to
+WARMING = 0.5  # degC: a temperature that moves by less is a thermocouple's noise
 
 
 def transient(recording: Recording) -> Figures:
@@ -126,18 +129,43 @@ def feedforward(recording: Recording) -> Figures:
     }
 
 
-def step(recording: Recording) -> Figures:
-    """Return the figures of a step of the reference (Fig. 13).
+def steps(recording: Recording) -> list[Recording]:
+    """Return the parts of a recording in which the reference goes from one value that it holds to the next.
 
-    A step at sample 0 is one from rest. Settling is into 5 % and 2 % of the final value; overshoot and
-    static error are in % of the step (:func:`piezo_control.metrics.step_metrics`).
+    Each begins with the last sample of the value before and ends with the last one of the value after; what
+    is between is how the reference went there, a jump or a ramp. A reference that is there at sample 0 is a
+    step from rest, the only one that begins with its value.
     """
-    begin = _begin(recording.reference, "reference")
-    initial = float(recording.reference[begin - 1]) if begin else 0.0
-    reference = float(recording.reference[-1])
-    figures = metrics.step_metrics(
-        recording.time[begin:], recording.deflection[begin:], reference, initial
-    )
+    _need(recording, "reference")
+    reference = recording.reference
+    edges = [0, *(np.flatnonzero(np.diff(reference)) + 1).tolist(), reference.size]
+    stays = [(a, b) for a, b in pairwise(edges) if b - a >= SHORTEST_HOLD or a == 0]
+    parts = []
+    if recording.number[0] == 0 and reference[0] != 0.0 and stays[0][1] >= SHORTEST_HOLD:
+        parts.append(recording.part(slice(0, stays[0][1])))
+    for (_, left), (begin, end) in pairwise(stays):
+        if reference[begin] != reference[left - 1]:
+            parts.append(recording.part(slice(left - 1, end)))
+    return parts
+
+
+def step(recording: Recording) -> Figures:
+    """Return the figures of the last step of the reference (Fig. 13).
+
+    Times count from when the reference begins to move. Settling is into 5 % and 2 % of the final value;
+    overshoot and static error are in % of the step (:func:`piezo_control.metrics.step_metrics`).
+    """
+    found = steps(recording)
+    if not found:
+        raise ValueError(
+            "the reference goes from no value that it holds to another: there is no step"
+        )
+    last = found[-1]
+    reference, initial = float(last.reference[-1]), float(last.reference[0])
+    begin = 1
+    if initial == reference:
+        begin, initial = 0, 0.0  # from rest
+    figures = metrics.step_metrics(last.time[begin:], last.deflection[begin:], reference, initial)
     return {
         "reference_um": reference * 1e6,
         "settling_time_5pct_ms": _finite(figures.settling_5_final_s * 1e3),
@@ -166,7 +194,14 @@ def frequency(recording: Recording) -> Figures:
 def frequency_response(recording: Recording) -> metrics.FrequencyResponse:
     """Return the measured response of the deflection to the reference."""
     _need(recording, "reference")
-    return metrics.frequency_response(recording.time, recording.reference, recording.deflection)
+    spacing = np.median(np.diff(recording.time))
+    count = round((recording.time[-1] - recording.time[0]) / spacing) + 1
+    # A sample that was lost would shift all that follow: in its place is the straight line across.
+    time = np.linspace(recording.time[0], recording.time[-1], count)
+    signals = (
+        np.interp(time, recording.time, s) for s in (recording.reference, recording.deflection)
+    )
+    return metrics.frequency_response(time, *signals)
 
 
 def thermal(recording: Recording) -> Figures:
@@ -230,29 +265,45 @@ def analyse(recording: Recording, kind: str) -> Figures:
 def classify(recording: Recording) -> str:
     """Return the kind of experiment that the signals of a recording suggest.
 
-    In this order: a tip force that changes, a temperature that changes, a reference of many frequencies,
-    a cyclic one (`hysteresis` when the voltage is proportional to it), a voltage held under a static
-    gain (`creep` when that lasts for more than 10 s), any other reference: a step. Without a reference
-    the voltage decides.
+    In this order: a reference that goes from value to value, which a controller follows; a tip force that
+    changes, a temperature that changes; a reference of many frequencies; a cyclic one (`hysteresis` when the
+    voltage is proportional to it, `excite` when its amplitude changes, too); a voltage held under a static
+    gain (`creep` when that lasts for more than 10 s); any other reference: a step. Without a reference the
+    voltage decides.
     """
-    for kind, signal in (("force", recording.tip_force), ("thermal", recording.temperature)):
-        if np.ptp(signal) > 0.0:
-            return kind
     has_reference = bool(np.all(np.isfinite(recording.reference)))
     drive = recording.reference if has_reference else recording.voltage
     if not np.all(np.isfinite(drive)):
         raise BagError("neither reference nor voltage was recorded: name the kind of experiment")
     is_static = not has_reference or _is_proportional(recording.voltage, drive)
-    turns = np.count_nonzero(
-        np.diff(np.sign(np.diff(drive[np.diff(drive, prepend=np.nan) != 0.0])))
-    )
-    if turns > 20:
-        return "frequency"
-    if turns > 1:
-        return "hysteresis" if is_static else "feedforward"
+    if not is_static and len(steps(recording)) > 1:
+        return "step"
+    if np.ptp(recording.tip_force) > 0.0:
+        return "force"
+    if np.ptp(recording.temperature) >= WARMING:
+        return "thermal"
+    tops, bottoms = _turns(drive), _turns(-drive)
+    if tops.size + bottoms.size > 1:
+        if not (_is_even(np.diff(tops)) and _is_even(np.diff(bottoms))):
+            return "frequency"
+        if not is_static:
+            return "feedforward"
+        return "hysteresis" if _is_even(drive[tops]) and _is_even(drive[bottoms]) else "excite"
     if not is_static:
         return "step"
     return "creep" if recording.time[-1] > 10.0 else "transient"
+
+
+def _turns(drive: np.ndarray) -> np.ndarray:
+    """Return the samples at which a signal turns down by more than a tenth of its range: noise does not."""
+    from scipy.signal import find_peaks
+
+    return find_peaks(drive, prominence=0.1 * np.ptp(drive))[0]
+
+
+def _is_even(values: np.ndarray) -> bool:
+    """Say whether values are equal within a fifth."""
+    return values.size == 0 or bool(np.ptp(values) <= 0.2 * np.max(np.abs(values)))
 
 
 def _is_proportional(value: np.ndarray, drive: np.ndarray) -> bool:

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from piezo_control.identification.columns import LOOP, add_options, chosen_columns
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.analysis import ANALYSES
@@ -124,9 +125,9 @@ def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> N
     """Analyse bags one by one."""
     from piezo_sim.experiment.bags import analyse_bags
 
-    found = _read_bags(arguments)
+    found = _analyse(arguments)
     with results_folder(out, overwrite=True) as folder:
-        sections = analyse_bags(found, arguments.kind, folder)
+        sections = analyse_bags(found, folder)
         write_html(folder / "report.html", "Analysis of recorded bags", sections)
     print_tables(console, sections)
 
@@ -135,11 +136,11 @@ def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> N
     """Compare bags in one plot and one table."""
     from piezo_sim.experiment.bags import compare_bags
 
-    found = _read_bags(arguments)
+    found = _analyse(arguments)
     if len(found) < 2:
         raise ParameterError(f"compare needs two bags or more, not {len(found)}")
     with results_folder(out, overwrite=True) as folder:
-        sections = compare_bags(found, arguments.kind, folder)
+        sections = compare_bags(found, folder)
         write_html(folder / "report.html", "Comparison of recorded bags", sections)
     print_tables(console, sections)
 
@@ -153,10 +154,15 @@ def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> N
             console.print(recover(path, folder / path.name), soft_wrap=True)
 
 
-def _read_bags(arguments: argparse.Namespace) -> dict[str, Any]:
-    from piezo_sim.experiment.bags import recordings
+def _analyse(arguments: argparse.Namespace) -> dict[str, Any]:
+    from piezo_sim.experiment.bags import analysed
 
-    return recordings(arguments.bags, arguments.finger, arguments.run, arguments.partial)
+    a = arguments
+    found = analysed(a.bags, a.kind, a.finger, a.run, a.partial, *chosen_columns(arguments, LOOP))
+    for name, one in found.items():
+        if one.left_out:
+            print(f"{name}: {one.left_out}")
+    return found
 
 
 def print_tables(console: Console, sections: Sequence[Section]) -> None:
@@ -175,8 +181,8 @@ def parser() -> argparse.ArgumentParser:
         command.set_defaults(run_command=run_experiment)
         _add_experiment_options(command, name)
     for name, text, function in (
-        ("analyse", "analyse recorded bags: each with plot and table", run_analyse),
-        ("compare", "compare recorded bags: one plot, one table, differences", run_compare),
+        ("analyse", "analyse bags and tables: each with plot and table", run_analyse),
+        ("compare", "compare bags and tables: one plot, one table, differences", run_compare),
     ):
         command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
         command.set_defaults(run_command=function)
@@ -222,8 +228,8 @@ def _add_experiment_options(command: argparse.ArgumentParser, name: str) -> None
 
 def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) -> None:
     command.add_argument(
-        "bags", type=Path, nargs="+", metavar="BAG",
-        help=f"{least} rosbag2 folders, or .mcap or .db3 files",
+        "bags", type=Path, nargs="+", metavar="RECORDING",
+        help=f"{least} rosbag2 folders, .mcap or .db3 files, or tables",
     )  # fmt: skip
     command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
     command.add_argument(
@@ -237,6 +243,7 @@ def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) ->
     command.add_argument(
         "--partial", action="store_true", help="use what can be read of a damaged bag"
     )
+    add_options(command, LOOP)
 
 
 def namespace(text: str) -> str:

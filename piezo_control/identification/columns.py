@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the columns of a table may hold, with their units, and how a command line names them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+
+QUANTITIES = {  # the units a column may have, the first of them where nothing says which
+    "time": ("s", "ms", "us", "min"),
+    "voltage": ("V", "mV", "kV"),
+    "deflection": ("m", "mm", "um", "nm"),
+    "temperature": ("degc",),
+    "tip_force": ("N", "mN", "uN"),
+}
+LOOP = {**QUANTITIES, "reference": QUANTITIES["deflection"], "command": QUANTITIES["deflection"]}
+"""The same, and what a loop has beside."""
+
+
+def add_options(parser: argparse.ArgumentParser, quantities: Mapping[str, tuple[str, ...]]) -> None:
+    """Add what names the columns of a table on the command line; :func:`chosen_columns` reads it."""
+    group = parser.add_argument_group(
+        "tables",
+        "text, .mat, .npz or .parquet; COLUMN is a name, a part of one, or a number from 0",
+    )
+    for quantity, units in quantities.items():
+        group.add_argument(
+            f"--{quantity.replace('_', '-')}", metavar="COLUMN[:UNIT]",
+            help=f"column of the {quantity.replace('_', ' ')}; units {', '.join(units)}",
+        )  # fmt: skip
+    group.add_argument(
+        "--sample-rate", type=float, metavar="HZ",
+        help="rows come evenly; takes the place of a column with the time",
+    )  # fmt: skip
+
+
+def chosen_columns(
+    arguments: argparse.Namespace, quantities: Mapping[str, tuple[str, ...]]
+) -> tuple[dict[str, str], float | None]:
+    """Return the columns and the time between rows (s) that a command line names."""
+    named = {q: getattr(arguments, q) for q in quantities if getattr(arguments, q)}
+    return named, 1.0 / arguments.sample_rate if arguments.sample_rate else None

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bags as users make them: several references in one, lost samples, late joiners, clocks on the wall."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import Temperature
+
+from piezo_control.profile import Profile
+from piezo_control.recording.recording import (
+    PROFILE_TYPE,
+    SAMPLE_TYPE,
+    TEMPERATURE_TYPE,
+    BagError,
+    Recording,
+    read,
+)
+from piezo_control.recording.writer import BagWriter
+from piezo_gripper_msgs.msg import Profile as ProfileMessage
+from piezo_gripper_msgs.msg import Sample
+from piezo_sim.experiment.analysis import classify, steps
+from piezo_sim.experiment.bags import analysed, compare_bags
+
+H = 1e-3  # s
+LAG = 0.02  # s, of a finger that follows with a first-order lag: settles to 5 % in 3.0 and to 2 % in 3.9 lags
+WALL = 1_764_000_000 * 10**9  # ns
+
+
+def follow(reference, sample_time=H, lag=LAG):
+    """Return the exact response of a first-order lag to a reference that is held from sample to sample."""
+    kept, value, response = np.exp(-sample_time / lag), 0.0, []
+    for wanted in reference:
+        response.append(value)
+        value = wanted + kept * (value - wanted)
+    return np.array(response)
+
+
+def recording(**signals):
+    """Return a recording with these signals; the others were not recorded."""
+    count = len(next(iter(signals.values())))
+    nothing = dict.fromkeys(
+        (f.name for f in fields(Recording) if f.name not in ("number", "time")),
+        np.full(count, np.nan),
+    )
+    return Recording(number=np.arange(count), time=H * np.arange(count), **{**nothing, **signals})
+
+
+class Session:
+    """A finger in a bag as `ros2 bag record` makes it: stamps of the wall, its own time of receipt."""
+
+    def __init__(self, path):
+        self.bag = BagWriter(path)
+        self.topics = {}
+
+    def put(self, name, kind, message, stamp, received):
+        if name not in self.topics:
+            self.topics[name] = self.bag.add(f"/f/{name}", kind)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp, 10**9)
+        self.bag.write(self.topics[name], received, serialize_message(message))
+
+    def sample(self, name, number, value, stamp, delay=30_000):
+        message = Sample(number=number, value=float(value), period=H)
+        self.put(name, SAMPLE_TYPE, message, stamp, stamp + delay)
+
+
+REFERENCE = np.repeat([5e-6, 10e-6, -5e-6], 300)
+
+
+def session(path, first=0, lost=(), voltage_from=0, said=True):
+    """Write profile 5 µm, set-point 10 µm, profile -5 µm; each arrives at the recorder before it is followed."""
+    bag = Session(path)
+    deflection = follow(REFERENCE)
+    for number in range(first, REFERENCE.size):
+        stamp = WALL + number * 1_000_000
+        if number % 300 == 0 or number == first:
+            asked = ProfileMessage(time=[0.0], value=[REFERENCE[number]])
+            before = stamp - 12_000_000  # twelve samples earlier
+            if number == 300:
+                bag.put("reference", SAMPLE_TYPE, Sample(value=10e-6), 0, before)
+            else:
+                bag.put("reference_profile", PROFILE_TYPE, asked, 0, before)
+            if said:
+                bag.put("reference_followed_profile", PROFILE_TYPE, asked, stamp, stamp + 900_000)
+        if number not in lost:
+            bag.sample("deflection", number, deflection[number], stamp)
+        if number >= voltage_from and number + 1 not in lost:
+            bag.sample("command", number, REFERENCE[number], stamp, 200_000)
+            bag.sample("voltage", number, 2e6 * REFERENCE[number] + number % 2, stamp, 400_000)
+        if number % 100 == 50:
+            warm = Temperature(temperature=22.0 + 0.01 * (number % 3))
+            bag.put("temperature", TEMPERATURE_TYPE, warm, stamp, stamp)
+    bag.bag.close()
+    return path
+
+
+def test_the_reference_is_the_one_that_was_followed(tmp_path):
+    np.testing.assert_array_equal(read(session(tmp_path / "said")).reference, REFERENCE)
+    arrived = read(session(tmp_path / "silent", said=False)).reference
+    np.testing.assert_array_equal(arrived[:288], REFERENCE[:288])
+    assert arrived[289] == 10e-6  # the best that can be known: when it came
+
+
+def test_every_step_has_its_figures(tmp_path):
+    (one,) = analysed([session(tmp_path / "bag")]).values()
+    assert one.kind == "step" and one.left_out == ""
+    assert list(one.figures) == ["0 s: 0 → 5 µm", "0.3 s: 5 → 10 µm", "0.6 s: 10 → -5 µm"]
+    for figures, reference in zip(one.figures.values(), (5.0, 10.0, -5.0)):
+        assert figures["reference_um"] == pytest.approx(reference)
+        assert figures["settling_time_5pct_ms"] == pytest.approx(np.log(20) * LAG * 1e3, abs=1.01)
+        assert figures["settling_time_2pct_ms"] == pytest.approx(np.log(50) * LAG * 1e3, abs=1.01)
+        assert figures["rise_time_ms"] == pytest.approx(np.log(9) * LAG * 1e3, abs=0.05)
+        assert figures["overshoot_percent"] == 0.0 and figures["static_error_percent"] < 0.01
+
+
+def test_a_ramp_from_value_to_value_is_one_step():
+    time = H * np.arange(2000)
+    reference = Profile([0.5, 0.7, 1.5, 1.6], [0.0, 2e-5, 2e-5, -1e-5], linear=True).at(time)
+    found = steps(recording(reference=reference, deflection=follow(reference)))
+    assert [(p.reference[0], p.reference[-1]) for p in found] == [(0.0, 2e-5), (2e-5, -1e-5)]
+    assert [p.time[0] for p in found] == pytest.approx([0.5, 1.5], abs=1.5 * H)
+    assert found[0].time[-1] == pytest.approx(1.5, abs=1.5 * H)
+
+
+def test_what_is_missing_is_left_out_and_said(tmp_path):
+    lost = {400, 401, 700}
+    path = session(tmp_path / "bag", first=100, lost=lost, voltage_from=140)
+    (one,) = analysed([path]).values()
+    assert one.left_out == (
+        "left out: 40 at the beginning, without command or voltage; 2 in between, without command or voltage; "
+        "the bag begins at sample 100; 3 of 800 samples were not recorded, the first is 400"
+    )
+    kept = [n for n in range(140, 900) if n not in lost | {n - 1 for n in lost}]
+    assert one.recording.number.tolist() == kept
+    np.testing.assert_array_equal(one.recording.reference, REFERENCE[kept])
+    assert np.isfinite(one.recording.temperature).all()
+    # It was there at the beginning, so no step is seen of it.
+    assert list(one.figures) == ["0.2 s: 5 → 10 µm", "0.5 s: 10 → -5 µm"]
+    # 3 of 40 ms are between lost samples: the figures stay those of the lag.
+    assert one.figures["0.5 s: 10 → -5 µm"]["settling_time_5pct_ms"] == pytest.approx(60, abs=1.5)
+
+
+def test_bags_with_as_many_steps_are_compared_step_by_step(tmp_path):
+    found = analysed([session(tmp_path / "a"), session(tmp_path / "b", lost={450})])
+    section, _ = compare_bags(found, tmp_path)
+    assert [row[0] for row in section.rows][:4] == [
+        "a 0 s: 0 → 5 µm", "a 0.3 s: 5 → 10 µm", "a 0.6 s: 10 → -5 µm", "b 0 s: 0 → 5 µm",
+    ]  # fmt: skip
+    assert section.rows[6][0] == "  b − a 0 s: 0 → 5 µm" and float(section.rows[6][2]) == 0.0
+    assert "b: 898 samples" in section.text and "1 of 900 samples were not recorded" in section.text
+
+
+def test_a_bag_without_one_whole_sample_is_refused():
+    nan = np.full(50, np.nan)
+    halves = [np.concatenate(h) for h in ((np.ones(50), nan), (nan, np.ones(50)))]
+    with pytest.raises(BagError, match="no sample has all of deflection, voltage"):
+        recording(deflection=halves[0], voltage=halves[1]).complete()
+
+
+def test_an_excitation_is_no_frequency_response():
+    """A decaying sine of the voltage, of which the reference is a multiple; a multisine; noise on a sine."""
+    time = H * np.arange(20_000)
+    sine = np.sin(2 * np.pi * time)
+    decaying = 40.0 * np.minimum(1.0, (20 - time) / 19) * sine
+    noise = np.random.default_rng(1).normal(0.0, 0.1, time.size)
+    many = sum(np.sin(2 * np.pi * f * time + f**2) for f in (0.5, 1.1, 2.3, 5.3))
+    base = {"temperature": np.full(time.size, 22.0), "tip_force": np.zeros(time.size)}
+
+    def kind(reference, voltage):
+        return classify(recording(reference=reference, voltage=voltage, deflection=voltage, **base))
+
+    assert kind(decaying * 1e-6, decaying) == "excite"
+    assert kind(np.full(time.size, np.nan), decaying + noise) == "excite"
+    assert kind(sine * 1e-6, 40 * sine) == "hysteresis"
+    assert kind(sine * 1e-6, 40 * sine + 5 * sine**3) == "feedforward"
+    assert kind(many * 1e-6, 40 * many + 5 * many**3) == "frequency"
+
+
+def test_tables_are_analysed_as_bags_are(tmp_path):
+    """The same session as a spreadsheet would have it: figures as from the bag, a lost row counted."""
+    deflection, rows = follow(REFERENCE), np.delete(np.arange(REFERENCE.size), 450)
+    lines = ["Zeit (ms);Soll [µm];Ist [µm];U [V]"]
+    for k in rows:
+        values = (1e3 * H * k, 1e6 * REFERENCE[k], 1e6 * deflection[k], 2e6 * REFERENCE[k] + k % 2)
+        lines.append(";".join(f"{value:.6f}".replace(".", ",") for value in values))
+    table = tmp_path / "session.csv"
+    table.write_text("\n".join(lines), encoding="cp1252")
+    columns = {"time": "Zeit", "reference": "Soll", "deflection": "Ist", "voltage": "U"}
+    found = analysed([table, session(tmp_path / "bag")], columns=columns)
+    one, other = found["session.csv"], found["bag"]
+    assert "deflection = column 'Ist [µm]' [um]" in one.left_out
+    assert "1 of 900 samples were not recorded, the first is 450" in one.left_out
+    assert list(one.figures) == list(other.figures)
+    for figures, others in zip(one.figures.values(), other.figures.values()):
+        assert figures["settling_time_2pct_ms"] == pytest.approx(others["settling_time_2pct_ms"])
+        assert figures["rise_time_ms"] == pytest.approx(others["rise_time_ms"], abs=0.01)
+    with pytest.raises(
+        BagError, match="session.csv: no column for 'deflection'; the file has Zeit"
+    ):
+        analysed([table])
