@@ -104,6 +104,7 @@ class Feedforward:
     """
 
     def __init__(self, parameters: FeedforwardParameters, sample_time: float) -> None:
+        self._rest = parameters.rest
         operator = coefficients(parameters.hysteresis, sample_time)
         self.coefficients = FeedforwardCoefficients(
             inverting=parameters.compensator != "static_gain",
@@ -117,12 +118,11 @@ class Feedforward:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: a homed finger at the voltage nearest to 0 V, no clipped sample."""
+        """Forget everything: a homed finger at its rest voltage, no clipped sample."""
         plays = [0.0] * len(self.coefficients.operator.weights)
         self.state = FeedforwardState(State(plays, voltage=[0.0], voltage_step=[0.0]), [0.0])
-        rest = min(max(0.0, self.coefficients.low), self.coefficients.high)
-        if rest:
-            self.follow(rest)
+        if self._rest:
+            self.follow(self._rest)
 
     def step(self, command: float, share: float = 1.0) -> float:
         """Return the voltage (V) for the commanded deflection (m) of this sample.

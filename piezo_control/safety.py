@@ -3,8 +3,8 @@
 
 One law for every mode and every place that moves a voltage. The voltage stays within its limits and changes
 by no more than the slew limit times the time that has passed. An input that stays away is bridged by holding
-the voltage for `hold_time`; then, as at any other fault, the voltage goes to rest, the voltage nearest to
-0 V, and stays there until somebody resets the fault. The cause, when it was seen first and how often are
+the voltage for `hold_time`; then, as at any other fault, the voltage goes to rest, at `rest_voltage`,
+and stays there until somebody resets the fault. The cause, when it was seen first and how often are
 kept for whoever asks.
 """
 
@@ -52,6 +52,10 @@ class VoltageParameters:
         # The fastest controller takes 1.4 V a sample of 0.1 ms for 20 µm, so 2.8 V for the whole stroke.
         4e4, "largest rate of the voltage", unit="V/s", low=1e-3, high=1e6,
     )  # fmt: skip
+    rest_voltage: float = parameter(
+        0.0, "where the finger is left alone, such as the middle of a unipolar actuator; 0: the voltage nearest "
+        "to 0 V within the limits", unit="V", low=-LARGEST_VOLTAGE, high=LARGEST_VOLTAGE,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if not self.voltage_low < self.voltage_high:
@@ -59,6 +63,16 @@ class VoltageParameters:
                 f"'voltage_low' is {self.voltage_low!r} V, must be below 'voltage_high' "
                 f"({self.voltage_high!r} V)"
             )
+        if self.rest_voltage and not self.voltage_low <= self.rest_voltage <= self.voltage_high:
+            raise ParameterError(
+                f"'rest_voltage' is {self.rest_voltage!r} V, must be within 'voltage_low' and 'voltage_high': "
+                f"[{self.voltage_low:g}, {self.voltage_high:g}] V, or 0 for the one nearest to 0 V"
+            )
+
+    @property
+    def rest(self) -> float:
+        """The voltage (V) at which a finger that is left alone stands."""
+        return min(max(self.rest_voltage, self.voltage_low), self.voltage_high)
 
 
 class Limits(NamedTuple):
@@ -74,7 +88,7 @@ class Limits(NamedTuple):
 def limits(voltage: VoltageParameters, ramp: float) -> Limits:
     """Return the limits; `ramp` (V/s) never exceeds the slew limit."""
     low, high, slew = voltage.voltage_low, voltage.voltage_high, voltage.slew_limit
-    return Limits(low, high, slew, min(ramp, slew), min(max(0.0, low), high))
+    return Limits(low, high, slew, min(ramp, slew), voltage.rest)
 
 
 # Step functions: plain scalars, so that numba can compile them as they are.

@@ -99,6 +99,7 @@ class SensorlessCoefficients(NamedTuple):
     step_limit: float  # V per sample
     coldest: float  # °C
     warmest: float  # °C
+    rest: float  # V
 
 
 class SensorlessState(NamedTuple):
@@ -153,13 +154,14 @@ def sensorless_coefficients(
         step_limit=p.slew_limit * sample_time,
         coldest=p.temperature_low,
         warmest=p.temperature_high,
+        rest=p.rest,
     )
 
 
 def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> SensorlessState:
-    """Return the state of a homed finger at 0 V, in equilibrium with `temperature_degc`."""
+    """Return the state of a homed finger at its rest voltage, in equilibrium with `temperature_degc`."""
     start = min(max(temperature_degc, c.coldest), c.warmest)
-    return SensorlessState(
+    state = SensorlessState(
         hysteresis=State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0]),
         relaxations=[0.0] * len(c.creep.retained),
         body=Body([start], degc_at_start=[start]),
@@ -167,6 +169,8 @@ def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> Senso
         offset=[0.0],
         clipped=[0.0],
     )
+    state.past[:] = [operator_step(c.operator, state.hysteresis, c.rest)] * len(c.taps)
+    return state
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
@@ -272,7 +276,7 @@ class Sensorless:
         self.coefficients = sensorless_coefficients(parameters, sample_time)
         self.delay = shaping.delay(self.coefficients.taps, sample_time)
         self.state = sensorless_rest(self.coefficients, temperature_degc)
-        self.predicted = 0.0
+        self.predicted = static(self.coefficients, self.state)
         """Static deflection (m) that the models expect at the end of the last sample."""
         self._led = FROM_REST
 

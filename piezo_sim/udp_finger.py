@@ -82,8 +82,9 @@ class Report:
 def serve(
     line: Line, device: Device, clock: Clock, seen: Seen, hold: int, step: float, stop: np.ndarray
 ) -> None:
-    """Answer datagrams until `stop`; after `hold` ns without one go `step` (V) per ramp period to 0 V."""
+    """Answer datagrams until `stop`; after `hold` ns without one go `step` (V) per ramp period to rest."""
     heard = now(clock)
+    rest = device.plant.amplifier.rest
     while stop[0] == 0:
         line.length[0] = 128
         size = _recvfrom(
@@ -107,11 +108,11 @@ def serve(
                 line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
                 line.length[0],
             )  # fmt: skip
-        elif instant - heard > hold and device.demand[0] != 0.0:
+        elif instant - heard > hold and device.demand[0] != rest:
             if heard > 0:
                 seen.ramps[0] += 1.0
                 heard = 0  # counted
-            voltage = toward(0.0, step, device.demand[0])
+            voltage = toward(rest, step, device.demand[0])
         else:
             continue
         write(device, voltage, instant)

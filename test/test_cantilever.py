@@ -124,6 +124,21 @@ def test_first_reading_is_zero_and_rest_stays_at_rest_at_any_temperature():
         assert np.max(np.abs(run(cantilever, np.zeros(1000), temperature))) == 0.0
 
 
+@pytest.mark.parametrize("plant", ["prandtl_ishlinskii", "truth"])
+def test_a_finger_with_a_bias_begins_at_rest_with_every_mode(plant):
+    parameters = CantileverParameters(
+        plant=plant,
+        sensor=PERFECT,
+        amplifier=AmplifierParameters(voltage_low=0.0, voltage_high=60.0, rest_voltage=20.0),
+        modes=ModesParameters(frequency_hz=(4178.0,), damping=(0.017,), share=(0.08,)),
+    )
+    readings = run(Cantilever(parameters), np.full(200, 20.0), 22.0)
+    # 20 ms later only creep has moved it: 0.1 % of the stroke here.
+    assert readings == pytest.approx(readings[0], abs=0.1e-6)
+    if plant != "truth":  # sum_i w_i max(20 V - r_i, 0) of the default weights and thresholds
+        assert readings[0] == pytest.approx(9.151e-6, rel=1e-9)
+
+
 def test_warming_by_10_degrees_moves_the_free_tip_by_g():
     cantilever = Cantilever(CantileverParameters(sensor=PERFECT))
     temperatures = np.concatenate([np.full(10, 22.0), np.full(30000, 32.0)])

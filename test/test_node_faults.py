@@ -63,23 +63,25 @@ def diagnosed(neighbour, name):
     return words
 
 
-@pytest.mark.parametrize("use_sim_time", [False, True])
-def test_silence_ends_at_rest_and_stays_there_until_a_reset(neighbour, tmp_path, use_sim_time):
-    parameters = {"mode": "free_running", "hold_time": 0.2, "use_sim_time": use_sim_time}
-    with node("feedforward", tmp_path, **parameters):
+@pytest.mark.parametrize("use_sim_time, rest", [(False, 0.0), (True, 8.0)])
+def test_silence_ends_at_rest_and_stays_there_until_a_reset(
+    neighbour, tmp_path, use_sim_time, rest
+):
+    parameters = {"hold_time": 0.2, "use_sim_time": use_sim_time, "rest_voltage": rest}
+    with node("feedforward", tmp_path, mode="free_running", **parameters):
         voltages = neighbour.listen(Sample, "voltage")
         words = diagnosed(neighbour, "feedforward")
         stream = Stream(neighbour, "command", 18e-6)
         neighbour.wait(lambda: voltages and voltages[-1].value > 25.0)
         stream.timer.cancel()
-        neighbour.wait(lambda: voltages[-1].value == 0.0)
+        neighbour.wait(lambda: voltages[-1].value == rest)
         neighbour.wait(lambda: words() == "no command for 0.2 s")
         stream.timer.reset()  # the command is back, the voltage is not
         count = len(voltages)
         neighbour.wait(lambda: next(stream.numbers) and stream.timer.is_ready() or True)
         answer = reset(neighbour, "feedforward")
         assert answer.success and "no command for 0.2 s" in answer.message
-        assert all(v.value == 0.0 for v in voltages[count:])
+        assert all(v.value == rest for v in voltages[count:])
         neighbour.wait(lambda: voltages[-1].value > 25.0)
     steps = [abs(b.value - a.value) for a, b in zip(voltages, voltages[1:])]
     assert max(steps) <= 10.0 * (
@@ -90,7 +92,7 @@ def test_silence_ends_at_rest_and_stays_there_until_a_reset(neighbour, tmp_path,
 @pytest.mark.shows("deactivation, shutdown, SIGINT, SIGTERM, SIGHUP, SIGQUIT")
 @pytest.mark.parametrize("end", ["deactivation", "SIGTERM", "SIGHUP", "SIGQUIT"])
 def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
-    with node("feedforward", tmp_path) as processes:
+    with node("feedforward", tmp_path, rest_voltage=-3.0) as processes:
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
         neighbour.insist(command, sample(0, 5e-6), lambda: voltages)
@@ -104,7 +106,7 @@ def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
             process = processes.running["feedforward"]
             process.send_signal(signal.Signals[end])
             assert process.wait(TIMEOUT) == 0
-        neighbour.wait(lambda: voltages[-1].value == 0.0)
+        neighbour.wait(lambda: voltages[-1].value == -3.0)
 
 
 def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighbour, tmp_path):

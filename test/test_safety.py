@@ -2,6 +2,7 @@
 """The safety law by its properties: limits in time, hold, ramp, a fault that stays."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -44,10 +45,14 @@ def test_toward_rest_never_passes_it(rest, step, voltage):
     assert (nearer - rest) * (voltage - rest) >= 0.0
 
 
-def test_rest_is_the_allowed_voltage_nearest_to_0_v_and_the_ramp_no_steeper_than_the_slew():
+def test_rest_is_where_it_is_said_or_nearest_to_0_v_and_the_ramp_no_steeper_than_the_slew():
     assert limits(STACK, 1e7)[2:] == (1e4, 1e4, 0.0)
     assert limits(VoltageParameters(voltage_low=20.0, voltage_high=120.0), 1e3).rest == 20.0
     assert limits(VoltageParameters(voltage_low=-120.0, voltage_high=-20.0), 1e3).rest == -20.0
+    assert limits(replace(STACK, rest_voltage=75.0), 1e3).rest == 75.0
+    outside = r"'rest_voltage' is -1.0 V, must be within .* \[0, 150\] V"
+    with pytest.raises(ParameterError, match=outside):
+        replace(STACK, rest_voltage=-1.0)
     with pytest.raises(ParameterError, match="'voltage_low' is 50.0 V, must be below"):
         VoltageParameters(voltage_low=50.0)
 

@@ -32,6 +32,7 @@ def cell(parameter: str) -> str:
         ("voltage_low`, `voltage_high", FEEDFORWARD.voltage_low),
         ("slew_limit", FEEDFORWARD.slew_limit),
         ("amplifier.slew_limit", CANTILEVER.amplifier.slew_limit),
+        ("rest_voltage", FEEDFORWARD.rest_voltage),
         ("ramp", FEEDFORWARD.ramp),
         ("hold_time", FEEDFORWARD.hold_time),
         ("reply_timeout", CANTILEVER.reply_timeout),

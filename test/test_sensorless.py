@@ -160,6 +160,19 @@ def test_a_pause_is_what_as_many_samples_of_the_held_voltage_do(samples):
     assert laws[0].state.relaxations == pytest.approx(laws[1].state.relaxations, rel=1e-9)
 
 
+def test_a_finger_with_a_bias_stays_there_until_a_reference_comes():
+    law = Sensorless(SensorlessParameters(rest_voltage=20.0), H, 22.0)
+    home = law.predicted
+    assert home == pytest.approx(9.151e-6, rel=1e-9)  # sum_i w_i max(20 V - r_i, 0) of the defaults
+    assert law.voltage == 20.0
+    voltages = [law.step(home, 22.0) for _ in range(100)]
+    assert voltages == pytest.approx([20.0] * 100, abs=0.05)  # creep is undone
+    law.follow(20.0)
+    for _ in range(300):
+        law.step(3e-6, 22.0)
+    assert law.predicted == pytest.approx(3e-6, abs=1e-15)
+
+
 def test_it_is_the_same_law_compiled():
     pytest.importorskip("numba")
     runs = [

@@ -46,6 +46,7 @@ from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 from piezo_sim.driver import Simulation
 from piezo_sim.engine import run
+from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
@@ -99,7 +100,7 @@ class Bench:
         """The voltage went to rest within `within` seconds, by no more than ramp and slew limit allow."""
         self.run(round(within / H))
         assert self.watch.phase[0] == FAULT
-        assert self.voltages[-1] == 0.0
+        assert self.voltages[-1] == self.feedforward.rest
         assert np.abs(np.diff(self.voltages)).max() <= self.feedforward.slew_limit * H * (1 + 1e-9)
         assert np.abs(self.voltages).max() <= 40.0
 
@@ -173,6 +174,26 @@ def test_a_fault_stays_until_it_is_reset_and_then_the_loop_takes_over_from_rest(
     running.run(300)
     assert running.plant.measure() == pytest.approx(20e-6, rel=0.05)
     assert np.abs(np.diff(running.voltages)).max() <= 4.0 + 1e-9
+
+
+def test_a_finger_with_a_bias_begins_there_and_ends_there():
+    limits = {"voltage_low": 0.0, "voltage_high": 40.0, "rest_voltage": 20.0}
+    plant = CantileverParameters(amplifier=AmplifierParameters(**limits))
+    bench = Bench(plant=plant, feedforward=FeedforwardParameters(**limits))
+    # sum_i w_i max(20 V - r_i, 0) of the default weights and thresholds.
+    home = 9.151e-6
+    assert bench.plant.measure() == pytest.approx(home, abs=20e-9)
+    bench.run(300, reference=home)
+    assert np.abs(np.array(bench.voltages) - 20.0).max() < 0.2
+    bench.run(300, reference=3e-6)
+    assert bench.plant.measure() == pytest.approx(3e-6, abs=0.1e-6)
+    bench.run(1, status=FAILED)
+    bench.assert_at_rest(0.01)  # from below
+    law.rearm(bench.watch)
+    bench.run(300, reference=15e-6)
+    assert bench.plant.measure() == pytest.approx(15e-6, abs=0.1e-6)
+    bench.run(1, status=FAILED)
+    bench.assert_at_rest(0.01)  # from above
 
 
 def test_a_frozen_sensor_is_found_once_the_voltage_has_moved(running):
@@ -378,7 +399,8 @@ class Stand:
     def __init__(self, folder):
         self.folder = folder
         (folder / "finger.yaml").write_text(
-            "/**/cantilever:\n  ros__parameters: {sensor: {delay_samples: 0}}\n"
+            "/**/cantilever:\n  ros__parameters:\n    sensor: {delay_samples: 0}\n"
+            "    amplifier: {rest_voltage: 10.0}\n"
         )
         self.port = 0
         self.finger = self.start_finger()
@@ -397,7 +419,8 @@ class Stand:
         out = self.folder / "commissioned"
         commission = self.start(
             "commission", "--driver", "udp", "--driver-options", f"127.0.0.1:{self.port}",
-            "--write", "next_edge", "--sensor-scale", "2e-5", "--yes", "--out", str(out),
+            "--write", "next_edge", "--sensor-scale", "2e-5", "--rest-voltage", "10", "--yes",
+            "--out", str(out),
         )  # fmt: skip
         assert commission.wait(2 * TIMEOUT) == 0, self.log("commission")
         return out
@@ -472,9 +495,10 @@ def stand(tmp_path):
 def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     found = stand.commission()
     servo = load(found / "servo.yaml", "servo")
-    # The finger of the paper behind a sensor of -50 mV/µm with 1 V at zero, read at the next edge.
+    # The finger of the paper with a bias, behind a sensor of -50 mV/µm with 1 V at zero, read at the next edge.
     assert servo["sensor_scale"] == -2e-5 and servo["delay_samples"] == 0
-    assert servo["sensor_zero"] == pytest.approx(1.0, abs=1e-3)
+    # At rest it reads 0.81 V; what the bias does is known as well as the hysteresis, 0.5 % of 40 µm.
+    assert servo["sensor_zero"] == pytest.approx(1.0, abs=1e-2)
     finger = load(found / "cantilever.yaml", "cantilever")
     np.testing.assert_allclose(finger["dynamics.denominator"], (5.7e-8, 8.1e-6, 1.0), rtol=0.05)
     assert finger["sensor.delay_samples"] == 1
@@ -509,7 +533,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     stand.wait(lambda: stand.phase == FingerState.FAULT)
     expected = "no reading of the sensor for 2 s: nobody answers at this address"
     assert stand.states[-1].text == expected
-    assert stand.states[-1].voltage == 0.0
+    assert stand.states[-1].voltage == 10.0
     stand.finger = stand.start_finger()
     assert stand.call(Trigger, "servo/reset", Trigger.Request()).success
     stand.wait(lambda: stand.phase == FingerState.RUNNING and stand.is_at(20e-6))
@@ -521,7 +545,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     stand.finger.terminate()
     assert stand.finger.wait(TIMEOUT) == 0
     report = json.loads((stand.folder / "report.json").read_text())
-    assert report["last_voltage"] == 0.0
+    assert report["last_voltage"] == 10.0
     assert -40.0 <= report["lowest_voltage"] and report["highest_voltage"] <= 40.0
     if not report["lost_datagrams"]:
         assert report["largest_step"] <= 4.0 + 1e-9

@@ -6,7 +6,7 @@ in:  command (Sample, m), state (FingerState: the voltage that is applied when t
 out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator;
      expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later
 
-Running free, a command that stays away is held and then ramped to rest, the voltage nearest to 0 V, where
+Running free, a command that stays away is held and then ramped to rest, `rest_voltage`, where
 it stays until `~/reset`. When the node is deactivated, shut down or stopped by a signal, the voltage ramps to
 rest too, in either mode. A restart goes on from the voltage that is applied.
 
@@ -63,7 +63,7 @@ class FeedforwardNode(BlockNode):
         self._waiting: Sample | None = None  # for its temperature
         self._subscription: Subscription | None = None
         self._complained = ""
-        self._build(0.0)
+        self._build(self.parameters.rest)
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
         return names - {"hold_time", "ramp"}

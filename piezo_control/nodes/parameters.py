@@ -99,7 +99,10 @@ class ServoNodeParameters(ServoParameters):
         "", "parameter file of the inverse hysteresis and the limits; empty: the paper's finger"
     )
     voltage_share: float = parameter(
-        1.0, "share of the voltage limits that is used, for a first power-on", low=1e-3, high=1.0
+        1.0,
+        "share of the way from rest to the voltage limits that is used, for a first power-on",
+        low=1e-3,
+        high=1.0,
     )
     priority: int = parameter(
         80, "of the loop under the real-time scheduler; 0: ordinary scheduler", low=0, high=99
@@ -144,12 +147,15 @@ class RecorderParameters:
 
 
 def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
-    """Return inverse and limits of a parameter file, the limits scaled by the share that is to be used."""
+    """Return inverse and limits of a parameter file, the limits as near to rest as the share to be used says."""
     path = parameters.feedforward_file
     whole = build(FeedforwardParameters, load(path, "feedforward") if path else {}, path)
-    share = parameters.voltage_share
+    share, rest = parameters.voltage_share, whole.rest
     return replace(
-        whole, voltage_low=share * whole.voltage_low, voltage_high=share * whole.voltage_high
+        whole,
+        voltage_low=rest + share * (whole.voltage_low - rest),
+        voltage_high=rest + share * (whole.voltage_high - rest),
+        rest_voltage=rest,
     )
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an unknown card and finger to a directory that `servo` starts with, step by step.
 
-1. at rest: the sensor's zero and noise;
+1. at rest (`--rest-voltage`): the sensor's zero and noise;
 2. a small step of the voltage: sign and gain of the sensor;
 3. a small sweep: delay in samples, resonance, damping;
 4. a decaying sine over the whole range: the hysteresis;
@@ -152,7 +152,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class Rest:
-    """What the sensor reads at 0 V, m."""
+    """What the sensor reads at rest, m."""
 
     mean: float
     noise: float
@@ -160,7 +160,7 @@ class Rest:
 
 def at_rest(bench: Bench) -> Rest:
     """Read the sensor at rest."""
-    got = bench.move(Profile([0.0], [0.0]), 0.2)
+    got = bench.move(Profile([0.0], [bench.limits.rest]), 0.2)
     there = got.deflection[np.isfinite(got.deflection)]
     if not there.size:
         raise NoAnswer("the sensor gave no reading within half a second")
@@ -168,10 +168,11 @@ def at_rest(bench: Bench) -> Rest:
 
 
 def gain(bench: Bench, rest: Rest, voltage: float) -> float:
-    """Return deflection per volt (m/V) of a small step; negative if the sensor or a wire is reversed."""
-    got = bench.move(Profile([0.0, 0.3], [voltage, 0.0]), 0.6)
+    """Return deflection per volt (m/V) of a small step from rest; negative if sensor or wires are reversed."""
+    home = bench.limits.rest
+    got = bench.move(Profile([0.0, 0.3], [home + voltage, home]), 0.6)
     there = np.isfinite(got.deflection)
-    up = there & (got.voltage == voltage)
+    up = there & (got.voltage == home + voltage)
     # The second half of the step: the ringing is over.
     moved = float(np.mean(got.deflection[up][up.sum() // 2 :])) - rest.mean
     least = max(5.0 * rest.noise, 1e-12)
@@ -199,9 +200,9 @@ def commission(
     None if somebody did not agree. `agree(question)` is asked before each step that moves the finger.
     """
     a = bench.arguments
-    low, high = bench.limits.voltage_low, bench.limits.voltage_high
-    reach = max(abs(low), abs(high))
-    side = 1.0 if high >= -low else -1.0
+    low, high, home = bench.limits.voltage_low, bench.limits.voltage_high, bench.limits.rest
+    reach = max(home - low, high - home)
+    side = 1.0 if high - home >= home - low else -1.0
     rest = at_rest(bench)
     bench.zero = rest.mean / bench.scale
     console.print(f"at rest: {rest.mean * 1e6:.4g} µm, noise {rest.noise * 1e9:.3g} nm rms")
@@ -214,10 +215,10 @@ def commission(
         bench.scale, slope = -bench.scale, -slope
     console.print(f"gain: {slope * 1e6:.4g} µm/V, so {slope * (high - low) * 1e6:.3g} µm in all")
     amplitude = 0.5 * small
-    if not agree(f"sweep of ±{abs(amplitude):.3g} V around {amplitude:.3g} V?"):
+    if not agree(f"sweep of ±{abs(amplitude):.3g} V around {home + amplitude:.3g} V?"):
         return None
     wave = sweep(amplitude, SWEEP, a.sample_time)
-    swept = bench.measure(Profile(wave.time, amplitude + wave.value), SWEEP)
+    swept = bench.measure(Profile(wave.time, home + amplitude + wave.value), SWEEP)
     model = identify_dynamics(swept, swept.voltage)
     fit = quality(swept.deflection, model.deflection(swept.time, swept.voltage))
     console.print(
@@ -238,6 +239,8 @@ def commission(
     fit = quality(slow.deflection, shown)
     console.print(f"hysteresis: rms {fit.rms_percent:.2f} % of {fit.stroke * 1e6:.3g} µm")
     need(fit.rms_percent, "the hysteresis")
+    # What was called zero is the finger at rest; the model's zero is a homed finger at 0 V.
+    bench.zero -= float(deflection_history(hysteresis.parameters, [home])[0]) / bench.scale
     folder: Path = a.out
     folder.mkdir(parents=True, exist_ok=True)
     origin = f"Commissioned on driver '{a.driver}' ({a.driver_options or 'no options'})."
@@ -295,7 +298,7 @@ def main() -> int:
         if (a.out / "servo.yaml").exists() and not a.overwrite:
             raise ParameterError(f"{a.out} has a servo.yaml; name a new --out or give --overwrite")
         read_problem(a.problem)  # before anything moves
-        limits = VoltageParameters(a.voltage_low, a.voltage_high, a.slew_limit)
+        limits = VoltageParameters(a.voltage_low, a.voltage_high, a.slew_limit, a.rest_voltage)
         found = commission(
             Bench(a, limits, a.sensor_scale),
             console,
@@ -339,6 +342,10 @@ def parse() -> argparse.Namespace:
             f"--{name.replace('_', '-')}", type=float, default=getattr(limits, name), metavar=unit,
             help="what the finger stands (%(default)s)",
         )  # fmt: skip
+    parser.add_argument(
+        "--rest-voltage", type=float, default=limits.rest_voltage, metavar="V",
+        help="where the finger is left alone; 0: the voltage nearest to 0 V that it stands (%(default)s)",
+    )  # fmt: skip
     parser.add_argument(
         "--sensor-scale", type=float, default=1.0, metavar="M",
         help="size of the sensor's scale: m per unit of the card; the sign is found (%(default)s)",

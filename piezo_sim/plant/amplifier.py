@@ -29,12 +29,13 @@ class AmplifierParameters(VoltageParameters):
 
 
 class Amplifier(NamedTuple):
-    """Amplifier per sample: limits (V), largest change (V), part of a transient that is left."""
+    """Amplifier per sample: limits (V), largest change (V), part of a transient that is left, rest (V)."""
 
     low: float
     high: float
     change: float
     retained: float
+    rest: float
 
 
 def discretize(parameters: AmplifierParameters, sample_time: float) -> Amplifier:
@@ -45,6 +46,7 @@ def discretize(parameters: AmplifierParameters, sample_time: float) -> Amplifier
         high=parameters.voltage_high,
         change=parameters.slew_limit * sample_time,
         retained=math.exp(-2.0 * math.pi * bandwidth * sample_time) if bandwidth > 0.0 else 0.0,
+        rest=parameters.rest,
     )
 
 

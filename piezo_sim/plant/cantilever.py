@@ -170,9 +170,13 @@ def deviating(
 
 
 def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> CantileverState:
-    """Return the state at rest at 0 V, in equilibrium with `temperature_degc`."""
-    return CantileverState(
-        amplifier=AmplifierState(voltage=[0.0], clipped=[0.0]),
+    """Return the state of a homed finger at its rest voltage, in equilibrium with `temperature_degc`.
+
+    It was led there a moment ago, at 22 °C: nothing has crept yet.
+    """
+    voltage = m.amplifier.rest
+    state = CantileverState(
+        amplifier=AmplifierState(voltage=[voltage], clipped=[0.0]),
         hysteresis=State([0.0] * len(m.operator.weights), voltage=[0.0], voltage_step=[0.0]),
         bouc_wen=BoucWenState(lag=[0.0], voltage=[0.0]),
         body=Body([temperature_degc], degc_at_start=[temperature_degc]),
@@ -181,10 +185,14 @@ def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> Can
         tip_force=[0.0],
         readings=[0.0] * (delay_samples + 1),
     )
+    deflection = hysteresis_step(m, state, voltage)
+    state.motion.x[:] = [share * deflection for share in m.tip.shares]
+    state.readings[:] = [deflection] * len(state.readings)
+    return state
 
 
 def deflection_of(m: CantileverModel, s: CantileverState) -> float:
-    """Return the true deflection (m) from the position at the start."""
+    """Return the true deflection (m) from the position of a homed finger at 0 V."""
     total = s.motion.x[0] + thermal_deflection(m.thermal, s.body)
     for i in range(1, len(s.motion.x)):
         total += s.motion.x[i]
@@ -234,7 +242,7 @@ class Cantilever:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to sample 0: at rest, 0 V, random draws from the seed."""
+        """Go back to sample 0: homed and at rest, random draws from the seed."""
         self._state = rest(self._model, self.parameters.sensor.delay_samples, REFERENCE_DEGC)
         self._generators = generators(self.parameters.seed)
         self._draws: Iterator[tuple[float, float]] = iter(())
@@ -269,7 +277,7 @@ class Cantilever:
 
     @property
     def deflection(self) -> float:
-        """True deflection (m) from the position at the start."""
+        """True deflection (m) from the position of a homed finger at 0 V."""
         return deflection_of(self._model, self._state)
 
     @property
