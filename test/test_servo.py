@@ -24,9 +24,10 @@ from std_srvs.srv import Trigger
 
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
 from piezo_control.nodes.profile_input import waveform_message
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
-from piezo_control.parameters import ParameterError, load
+from piezo_control.parameters import ParameterError, dump, load
 from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING
 from piezo_control.servo import law
@@ -194,6 +195,19 @@ def test_a_finger_with_a_bias_begins_there_and_ends_there():
     assert bench.plant.measure() == pytest.approx(15e-6, abs=0.1e-6)
     bench.run(1, status=FAILED)
     bench.assert_at_rest(0.01)  # from above
+
+
+def test_a_share_of_the_voltage_begins_at_rest_and_never_leaves_the_limits(tmp_path):
+    def shared(**limits):
+        dump(tmp_path / "stack.yaml", "feedforward", limits)
+        used = ServoNodeParameters(feedforward_file=str(tmp_path / "stack.yaml"), voltage_share=0.1)
+        found = read_feedforward(used)
+        return found.voltage_low, found.rest, found.voltage_high
+
+    assert shared() == pytest.approx((-4.0, 0.0, 4.0))
+    assert shared(voltage_low=5.0, voltage_high=90.0) == pytest.approx((5.0, 5.0, 13.5))
+    stack = {"voltage_low": 0.0, "voltage_high": 150.0, "rest_voltage": 75.0}
+    assert shared(**stack) == pytest.approx((67.5, 75.0, 82.5))
 
 
 def test_a_frozen_sensor_is_found_once_the_voltage_has_moved(running):
