@@ -37,7 +37,7 @@ STRICT = ["-O2", "-std=c99", "-ffp-contract=off", "-Wall", "-Wextra", "-Wpedanti
 CORTEX_M7 = ["-mcpu=cortex-m7", "-mthumb", "-mfpu=fpv5-d16", "-mfloat-abi=hard"]
 CORTEX_M4 = ["-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard"]
 CROSS_TOOLS = ("arm-none-eabi-gcc", "arm-none-eabi-nm", "qemu-system-arm")
-ROBUST = read_controller("robust")
+FAST = read_controller("fast")
 
 BENT = HysteresisParameters(
     thresholds=(0.0, 4.0, 9.0, 15.0),
@@ -49,10 +49,10 @@ BENT = HysteresisParameters(
     rate_coefficient=2e-5,
 )
 CASES = {
-    "the paper's finger": (ServoParameters(), ROBUST, FeedforwardParameters()),
+    "the paper's finger": (ServoParameters(), FAST, FeedforwardParameters()),
     "dead zones, rate, unipolar, a reversed sensor, a short hold time": (
         ServoParameters(sensor_scale=-2e-5, sensor_zero=1.03, hold_time=5e-3),
-        ROBUST,
+        FAST,
         FeedforwardParameters(voltage_low=5.0, voltage_high=90.0, slew_limit=9e3, hysteresis=BENT),
     ),
     "static gain in open loop; ringing is taken for a limit cycle": (
@@ -189,7 +189,7 @@ def test_the_c_in_the_loop_has_the_bits_of_the_engine(tmp_path):
     # Without noise in the first reading: the engine's controller begins at rest, the servo's takes over.
     plant = CantileverParameters(sensor=replace(SensorParameters(), noise=0.0))
     step = Profile([0.0, 0.005, 0.03], [0.0, 20e-6, -15e-6])
-    expected = run(plant, FeedforwardParameters(), ROBUST, TemperatureParameters(), step, 1000)
+    expected = run(plant, FeedforwardParameters(), FAST, TemperatureParameters(), step, 1000)
     write(tmp_path, firmware("finger", *CASES["the paper's finger"]))
     compile_with("gcc", tmp_path, ["finger.c"], "-shared", "-fPIC", "-o", "finger.so")
     finger = ctypes.CDLL(str(tmp_path / "finger.so"))
@@ -208,9 +208,9 @@ def test_the_c_in_the_loop_has_the_bits_of_the_engine(tmp_path):
 def test_a_coefficient_that_is_wrong_in_its_last_digit_is_seen(tmp_path):
     assert run_vectors(tmp_path, CASES["the paper's finger"])[0] == 0
     source = tmp_path / "finger.c"
-    digits = repr(ROBUST.d)
+    digits = repr(FAST.d)
     assert source.read_text().count(digits) == 1
-    source.write_text(source.read_text().replace(digits, repr(np.nextafter(ROBUST.d, 2.0).item())))
+    source.write_text(source.read_text().replace(digits, repr(np.nextafter(FAST.d, 2.0).item())))
     compile_with("gcc", tmp_path, ["finger.c", "finger_test.c"], "-o", "finger_test")
     done = subprocess.run(
         ["./finger_test"], cwd=tmp_path, capture_output=True, text=True, timeout=60
@@ -219,7 +219,7 @@ def test_a_coefficient_that_is_wrong_in_its_last_digit_is_seen(tmp_path):
     assert done.stdout.startswith("sample 0: ")
 
 
-@pytest.mark.parametrize("controller", ["robust", "paper"])
+@pytest.mark.parametrize("controller", ["fast", "paper"])
 def test_single_precision_stays_within_its_tolerance(controller, tmp_path):
     parameters = (ServoParameters(), read_controller(controller), FeedforwardParameters())
     status, said = run_vectors(tmp_path, parameters, single=True)
@@ -284,7 +284,7 @@ def export(tmp_path, monkeypatch, capsys):
 
 def test_a_commissioned_finger_is_exported_from_its_directory(export, tmp_path):
     dump("feedforward.yaml", "feedforward", {"voltage_low": -60.0, "voltage_high": 50.0})
-    dump("feedback.yaml", "feedback", flatten(replace(ROBUST, name="mine */ \\")))
+    dump("feedback.yaml", "feedback", flatten(replace(FAST, name="mine */ \\")))
     servo = {
         "controller_file": "feedback.yaml",
         "feedforward_file": "feedforward.yaml",
