@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from piezo_control.design import cli as design
-from piezo_control.design.synthesis import SynthesisError
+from piezo_control.design.problem import SynthesisError
 from piezo_control.identification import cli as identification
 from piezo_control.parameters import ParameterError
 from piezo_control.servo import commission
