@@ -130,6 +130,8 @@ def run(way: Way, out: Path) -> dict[str, Path]:
         for finger in fingers:
             finger.wait_for(partial(is_running, finger))
         pick_and_place(ros.gripper(), fingers, way)
+        for finger in fingers:
+            finger.end_record()
         for processes in started:
             processes.check()
     return bags
