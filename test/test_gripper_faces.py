@@ -161,10 +161,10 @@ def test_joint_states_have_opening_and_deflections(faces):
 def test_joint_states_tell_the_speed(faces):
     speed = 20e-6
     faces.command(80e-6, velocity=[speed])  # 2 s
-    # 0.1 s of samples with 10 nm of quantum and 5 nm of noise, two fingers
-    faces.bench.wait(lambda: abs(faces.heard[-1].velocity[0] - speed) < 1e-6)
+    # 0.1 s of samples with 10 nm of quantum and 5 nm of noise; each finger goes in its own time
+    faces.bench.wait(lambda: all(abs(v + speed / 2) < 0.5e-6 for v in faces.heard[-1].velocity[1:]))
     state = faces.heard[-1]
-    assert list(state.velocity[1:]) == pytest.approx([-speed / 2, -speed / 2], abs=1e-6)
+    assert state.velocity[0] == pytest.approx(-sum(state.velocity[1:]))
     assert 40e-6 < state.position[0] < 80e-6
 
 
@@ -180,6 +180,7 @@ def test_a_command_out_of_reach_is_refused_with_the_reach(faces):
 def test_a_repeated_command_does_not_push_anew(faces):
     faces.command(20e-6, velocity=[20e-6], effort=[0.2e-3])
     faces.log_has("stopped by")
+    faces.bench.held()  # the last references have come
     sent = {side: len(faces.bench.references[side]) for side in SIDES}
     stops = faces.bench.log.read_text().count("stopped by")
     for _ in range(5):
