@@ -47,7 +47,14 @@ from piezo_control.thermal import (
 from piezo_sim.plant import amplifier, contact
 from piezo_sim.plant.amplifier import Amplifier, AmplifierParameters, AmplifierState, amplify
 from piezo_sim.plant.bouc_wen import BoucWen, BoucWenState, TruthParameters, bouc_wen_step
-from piezo_sim.plant.contact import ContactParameters, Tip, contact_force, move_tip, tip_of
+from piezo_sim.plant.contact import (
+    ContactParameters,
+    Tip,
+    contact_force,
+    move_tip,
+    parts_of,
+    tip_of,
+)
 from piezo_sim.plant.sensor import Sensor, SensorParameters, read
 
 DRAWS_AT_ONCE = 4096
@@ -139,6 +146,10 @@ def deviating(
     """
     heat = m.thermal
     tip = m.tip
+    a2 = tip.a2 / resonance**2
+    parts = tip.parts  # which the propagators of higher modes are for
+    if len(tip.higher) == 0:
+        parts = parts_of(a2, tip.elastic_constant, tip.stiffness, tip.sample_time)
     return CantileverModel(
         m.amplifier,
         m.is_truth,
@@ -154,14 +165,14 @@ def deviating(
         ),
         m.creep,
         tip_of(
-            tip.a2 / resonance**2,
+            a2,
             tip.a1 * damping / resonance,
             tip.elastic_constant,
             tip.stiffness,
             tip.damping,
             tip.free_play,
             tip.sample_time,
-            tip.parts,
+            parts,
             tip.shares,
             tip.higher,
         ),

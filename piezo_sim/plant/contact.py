@@ -75,10 +75,7 @@ def discretize(
 ) -> Tip:
     """Return the tip's exact motion for one sample time (s)."""
     a2, a1, _ = dynamics.denominator
-    parts = 1
-    if contact.stiffness > 0.0:
-        fastest = math.sqrt((1.0 + dynamics.elastic_constant * contact.stiffness) / a2)
-        parts = math.ceil(sample_time * fastest / PART)
+    parts = parts_of(a2, dynamics.elastic_constant, contact.stiffness, sample_time)
     higher: list[float] = []
     for hertz, damping in zip(modes.frequency_hz, modes.damping):
         omega = 2.0 * math.pi * hertz
@@ -95,6 +92,14 @@ def discretize(
         [1.0 - sum(modes.share), *modes.share],
         higher,
     )
+
+
+def parts_of(a2: float, elastic_constant: float, stiffness: float, sample_time: float) -> int:
+    """Return how many parts a sample is split into; a step function too, for fingers that deviate."""
+    if stiffness == 0.0:
+        return 1
+    fastest = math.sqrt((1.0 + elastic_constant * stiffness) / a2)
+    return math.ceil(sample_time * fastest / PART)
 
 
 def tip_of(
