@@ -59,7 +59,9 @@ def restart(bench: Bench) -> None:
     name = bench.draw.choice(NODES)
     process = bench.processes.running[name]
     process.send_signal(bench.draw.choice(SIGNALS))
-    bench.wait(10.0, lambda: process.poll() is not None)
+    if not bench.wait(10.0, lambda: process.poll() is not None):
+        process.kill()  # nohup and shells let their children ignore some signals
+        process.wait()
     bench.wait(bench.draw.choice((0.0, 0.5)))
     if name == "cantilever":
         bench.number = -1
