@@ -284,7 +284,11 @@ class Gripper:
         """Openings (m) within which it moves."""
 
     def move(self, opening: float, speed: float = 0.0, max_force: float = 0.0) -> Grip.Result:
-        """Go to an opening (m), pushing with `max_force` (N) at most; 0 for speed and force: the gripper's own."""
+        """Go to an opening (m), pushing with `max_force` (N) at most; 0 for speed and force: the gripper's own.
+
+        A gripper that has just been started is waited for until it has met its fingers.
+        """
+        self.ros.wait(lambda: self._problem() == "", lambda: f"'{self.node}': {self._problem()}")
         return self.ros.grip(opening, max_force, speed, self._action)
 
     def grasp(self, force: float, speed: float = 0.0) -> Grip.Result:
@@ -296,6 +300,13 @@ class Gripper:
                 f"{result.force * 1e3:.3g} mN"
             )
         return result
+
+    def _problem(self) -> str:
+        """Return what keeps the gripper from moving, as it says on `/diagnostics`."""
+        status = self.ros.diagnostics.get(self.node)
+        if status is None:
+            return "silent on '/diagnostics'"
+        return "" if status.level == DiagnosticStatus.OK else status.message
 
     def release(self, speed: float = 0.0) -> Grip.Result:
         """Go to the widest opening."""
