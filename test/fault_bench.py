@@ -49,11 +49,17 @@ class Network:
             f"{inside} link set inside up",
             f"{inside} link set lo up",
         ):
-            subprocess.run(command.split(), check=True, capture_output=True)
+            try:
+                subprocess.run(command.split(), check=True, capture_output=True)
+            except subprocess.CalledProcessError:
+                self.__exit__()
+                raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        subprocess.run(["ip", "netns", "delete", self.name], capture_output=True)
+        # The link first: the kernel takes its time with what is left in a namespace, and its name stays taken.
+        for command in (f"ip link delete {self.link}", f"ip netns delete {self.name}"):
+            subprocess.run(command.split(), capture_output=True)
 
     def set(self, state: str) -> None:
         """Put the link 'up' or 'down'."""

@@ -156,7 +156,7 @@ def test_nothing_is_replaced_unasked_and_no_bad_fit_is_written(identify, tmp_pat
     np.savetxt(outlier, rows, delimiter=",", header="time,voltage,deflection_um", comments="")
     words = ("--plays", "4", "--skip", "0", "--lag", "0")
     assert identify("hysteresis", outlier, *words) == 2
-    assert "explains too little" in capsys.readouterr().err
+    assert "too small an excursion" in capsys.readouterr().err
     path = tmp_path / "identified" / "feedforward.yaml"
     assert not path.exists()
     assert identify("hysteresis", good, *words) == 0

@@ -178,18 +178,19 @@ def parser() -> argparse.ArgumentParser:
     commands = main_parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, text in EXPERIMENTS.items():
         command = commands.add_parser(name, help=text, description=f"Experiment: {text}.")
-        command.set_defaults(run_command=run_experiment)
+        # The name once more, as argparse forgets it where "--" comes next.
+        command.set_defaults(run_command=run_experiment, command=name)
         _add_experiment_options(command, name)
     for name, text, function in (
         ("analyse", "analyse bags and tables: each with plot and table", run_analyse),
         ("compare", "compare bags and tables: one plot, one table, differences", run_compare),
     ):
         command = commands.add_parser(name, help=text, description=f"{text.capitalize()}.")
-        command.set_defaults(run_command=function)
+        command.set_defaults(run_command=function, command=name)
         _add_bag_options(command, name, least="two or more" if name == "compare" else "one or more")
     text = "make whole bags, below --out, of what can be read of cut ones"
     command = commands.add_parser("recover", help=text, description=f"{text.capitalize()}.")
-    command.set_defaults(run_command=run_recover)
+    command.set_defaults(run_command=run_recover, command="recover")
     command.add_argument("bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 folders")
     command.add_argument("--out", type=Path, help="new folder for the bags (default: out/recover)")
     return main_parser
