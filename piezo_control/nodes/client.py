@@ -123,8 +123,11 @@ class Newest:
 class Ros:
     """A connection to the nodes of this ROS domain; made by :func:`connect`."""
 
-    def __init__(self, node: Node, watcher: Node, timeout: float) -> None:
+    def __init__(
+        self, node: Node, watcher: Node, executor: SingleThreadedExecutor, timeout: float
+    ) -> None:
         self.node = node
+        self._executor = executor
         self.watcher = watcher
         self.timeout = timeout
         # Action clients stay: one that is destroyed while the thread waits for it ends the thread.
@@ -218,13 +221,13 @@ class Ros:
         self._grips[gripper] = client
         self.wait(client.server_is_ready, lambda: f"no gripper answers on '{gripper}'")
         goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
-        handle = self.result(
-            client.send_goal_async(goal, lambda message: on_feedback(message.feedback)), gripper
+        handle = self._ask(
+            gripper, client.send_goal_async, goal, lambda message: on_feedback(message.feedback)
         )
         if not handle.accepted:
             raise ClientError(f"the gripper refuses this goal; its log on '{gripper}' says why")
         try:
-            return self.result(handle.get_result_async(), gripper, timeout).result
+            return self._ask(gripper, handle.get_result_async, timeout=timeout).result
         except BaseException:
             handle.cancel_goal_async()
             raise
@@ -232,6 +235,15 @@ class Ros:
     def gripper(self, namespace: str = "") -> Gripper:
         """Return the gripper in a namespace."""
         return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
+
+    def _ask(self, who: str, ask: Callable[..., Future], *words: Any, timeout: float = 0.0) -> Any:
+        """Return what an action answers.
+
+        It is asked in the thread that hears it: rclpy takes an answer that is quicker than the note of the question
+        for somebody else's.
+        """
+        asked = self.result(self._executor.create_task(ask, *words), who)
+        return self.result(asked, who, timeout)
 
     def call(self, kind: Any, service: str, request: Any) -> Any:
         """Return the answer of a service."""
@@ -518,7 +530,7 @@ def connect(timeout: float = 10.0) -> Iterator[Ros]:
     thread = threading.Thread(target=spin, name="client", daemon=True)
     thread.start()
     try:
-        yield Ros(node, watcher, timeout)
+        yield Ros(node, watcher, executor, timeout)
     finally:
         done.set()
         thread.join()
