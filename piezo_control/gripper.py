@@ -211,7 +211,7 @@ class Motion:
         self.goal = goal
         self._parameters = parameters
         openings = [waypoint.opening for waypoint in goal.waypoints] or [goal.opening]
-        self._closing = max(map(self._reference, openings)) > min(references)
+        self.closing = max(map(self._reference, openings)) > min(references)
         self._arrivals = [math.inf] * len(references)
         self._places = [(math.inf, math.nan)] * len(references)  # since when (s) a tip is where (m)
 
@@ -257,7 +257,7 @@ class Motion:
         rest = [self.rests(*finger) for finger in zip(count(), times, deflections)]
         over = [time - arrival for time, arrival in zip(times, self._arrivals)]
         stalled = [push >= AT_LIMIT * self.goal.max_force for push in pushes]
-        if self._closing and any(stalled) and all(rest):
+        if self.closing and any(stalled) and all(rest):
             # A finger that touches nothing goes on to the end of its line.
             if all(at_limit or late >= 0.0 for at_limit, late in zip(stalled, over)):
                 text = f"stopped by {force:g} N, limit {self.goal.max_force:g} N"

@@ -350,7 +350,9 @@ class GripperNode(FingerNode):
             self._finish(failure("a new goal takes over"))
         self.motion = Motion(self.parameters, goal, [finger.place() for finger in self.fingers])
         for finger in self.fingers:
-            finger.max_force = goal.max_force
+            # Opening keeps the force that is held: the references are ahead of the tips, and more would push on.
+            if self.motion.closing or not finger.max_force:
+                finger.max_force = goal.max_force
         self.asker = asker
 
     def halt(self, reason: str) -> None:
