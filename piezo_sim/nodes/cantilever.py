@@ -138,6 +138,7 @@ class CantileverNode(FingerNode):
             self.guard.reset()
             self.pending_voltage = None
             self._look_around()
+            self._follow_guard()  # at once, so that `state` never tells a fault that is over
         if self.guard.is_latched:
             raise ValueError(self.text)
 
