@@ -4,7 +4,6 @@
 import pytest
 from faults import run_schedule
 
-
 # Known defect: after a link that was cut for seconds, the reference may not reach `feedback` again within 30 s.
 CUT = pytest.param(15, marks=pytest.mark.xfail(reason="reference lost after a cut link"))
 
