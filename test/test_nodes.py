@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -420,6 +421,18 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
     assert read(bag, run=0).number.tolist() == [0, 1, 2, 5]
     assert read(bag, run=1).deflection.tolist() == [-1e-6] * 3
     assert (bag / "metadata.yaml").exists()
+
+
+def test_signals_that_come_while_a_node_ends_change_nothing(neighbour, tmp_path):
+    """The end of Python itself included, which gives signals back their default."""
+    with node("feedback", tmp_path) as processes:
+        process = processes.running["feedback"]
+        neighbour.get("feedback", "autostart")  # it spins, so signals are its own
+        while process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(1e-3)
+        assert process.returncode == 0
 
 
 def test_a_killed_recorder_loses_the_last_second_at_most(neighbour, tmp_path):

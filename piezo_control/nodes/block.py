@@ -63,6 +63,7 @@ class BlockNode(FingerNode):
         self.sequence = Sequence()
         self.guard = Guard(hold_time=1.0)
         self._answers = False
+        self._waiting: tuple[Sample, str] | None = None  # a sample, and what it waits for
         self.finger: FingerState | None = None
         self.create_subscription(FingerState, "state", self._on_state, LATCHED)
         self._input = SoleInput(
@@ -72,6 +73,15 @@ class BlockNode(FingerNode):
     def restart(self) -> None:
         """Take up a new run, before its first sample."""
         raise NotImplementedError
+
+    def prepare(self, sample: Sample) -> str:
+        """Take up what else the answer to a sample of lock-step depends on; return what is still missing of it."""
+        return ""
+
+    def go_on(self) -> None:
+        """Answer the sample that waits, if there is one, now that something has come."""
+        if self._waiting:
+            self._on_sample(self._waiting[0])
 
     def compute(self, sample: Sample, answer: Sample) -> bool:
         """Write the answer to a sample, or say that there is none."""
@@ -102,6 +112,7 @@ class BlockNode(FingerNode):
             )
         self.sequence = Sequence(gaps=self.parameters.mode == "free_running")
         self._answers = False
+        self._waiting = None
         self.say(f"waits for '{self.resolve_topic_name(self.INPUT)}'")
         self._rearm()
 
@@ -118,7 +129,11 @@ class BlockNode(FingerNode):
             self._tell()
 
     def report(self) -> tuple[str, dict[str, Any]]:
-        return self.guard.cause, {"sample": self.sequence.next - 1, **base.told(self.guard)}
+        wrong = self.guard.cause
+        if self._waiting and not wrong:
+            sample, missing = self._waiting
+            wrong = f"sample {sample.number} waits for {missing}"
+        return wrong, {"sample": self.sequence.next - 1, **base.told(self.guard)}
 
     def _quality(self) -> QoSProfile:
         return SAMPLE if self.parameters.mode == "lockstep" else NEWEST
@@ -140,6 +155,7 @@ class BlockNode(FingerNode):
         )
 
     def _on_sample(self, sample: Sample) -> None:
+        self._waiting = None
         if not self.active or self.guard.is_latched:
             return
         number = sample.number
@@ -186,6 +202,9 @@ class BlockNode(FingerNode):
                 f"{self.parameters.age_limit:g} s; not acted upon",
                 throttle_duration_sec=1.0,
             )
+            return
+        if lockstep and (missing := self.prepare(sample)):
+            self._waiting = sample, missing
             return
         if kind == FIRST and lockstep and self.sequence.next != 0:
             self.restart()

@@ -45,7 +45,7 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-from piezo_control.gripper import GripperParameters, reach
+from piezo_control.gripper import GripperParameters, check_goal, reach
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput, waveform_message
 from piezo_control.nodes.qos import LATCHED, SETPOINT
@@ -58,6 +58,7 @@ from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 LOOK_PERIOD = 0.02  # s, between two looks at something that is waited for
+FIRST_MESSAGE = 0.3  # s in which the first message of a topic comes, if it does
 LEAD_TIME = 0.1  # s of the finger's time from sending a waveform to its start
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 STATE_TYPE = "piezo_gripper_msgs/msg/FingerState"
@@ -100,10 +101,12 @@ class Reading(NamedTuple):
 class Newest:
     """The newest message of a topic, taken when it is asked for; belongs to a node that nobody spins.
 
-    It subscribes when it is asked for the first time, as every sample costs whoever receives and sends it.
+    It subscribes when it is asked for the first time, as every sample costs whoever receives and sends it, and then
+    waits for a moment for the first of a topic that somebody publishes.
     """
 
     def __init__(self, node: Node, kind: type, topic: str) -> None:
+        self._node = node
         self._subscribe = partial(node.create_subscription, kind, topic, lambda _: None, LATEST)
         self._subscription: Any = None
         self._last: Any = None
@@ -112,12 +115,23 @@ class Newest:
         """Return the message; None before the first."""
         if self._subscription is None:
             self._subscription = self._subscribe()
+            end = time.monotonic() + FIRST_MESSAGE
+            topic = self._subscription.topic_name
+            while not self._take() and self._node.count_publishers(topic):
+                if time.monotonic() > end:
+                    break
+                time.sleep(LOOK_PERIOD)
+        self._take()
+        return self._last
+
+    def _take(self) -> bool:
+        """Take the message that has come, if one has."""
         s = self._subscription
         with s.handle:
             taken = s.handle.take_message(s.msg_type, s.raw)
         if taken is not None:
             self._last = taken[0]
-        return self._last
+        return taken is not None
 
 
 class Ros:
@@ -130,8 +144,6 @@ class Ros:
         self._executor = executor
         self.watcher = watcher
         self.timeout = timeout
-        # Action clients stay: one that is destroyed while the thread waits for it ends the thread.
-        self._grips: dict[str, ActionClient] = {}
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         """The newest of each node, by its full name."""
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -199,44 +211,11 @@ class Ros:
         if not result.successful:
             raise ClientError(f"'{node}' refuses: {result.reason}")
 
-    def grip(
-        self,
-        opening: float,
-        max_force: float = 0.0,
-        speed: float = 0.0,
-        gripper: str = "/grip",
-        on_feedback: Callable[[Grip.Feedback], None] = lambda _: None,
-        timeout: float = 120.0,
-    ) -> Grip.Result:
-        """Bring the fingers of a gripper to an opening, or stop at a force; return how it ended.
-
-        Parameters
-        ----------
-        opening, max_force, speed : m, N and m/s; 0 for force and speed: the gripper's own
-        gripper : the name of its action
-        on_feedback : called with opening and force on the way
-        timeout : s; when it is over the goal is canceled, and the fingers hold where they are
-        """
-        client = self._grips.get(gripper) or ActionClient(self.node, Grip, gripper)
-        self._grips[gripper] = client
-        self.wait(client.server_is_ready, lambda: f"no gripper answers on '{gripper}'")
-        goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
-        handle = self._ask(
-            gripper, client.send_goal_async, goal, lambda message: on_feedback(message.feedback)
-        )
-        if not handle.accepted:
-            raise ClientError(f"the gripper refuses this goal; its log on '{gripper}' says why")
-        try:
-            return self._ask(gripper, handle.get_result_async, timeout=timeout).result
-        except BaseException:
-            handle.cancel_goal_async()
-            raise
-
     def gripper(self, namespace: str = "") -> Gripper:
         """Return the gripper in a namespace."""
         return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
 
-    def _ask(self, who: str, ask: Callable[..., Future], *words: Any, timeout: float = 0.0) -> Any:
+    def ask(self, who: str, ask: Callable[..., Future], *words: Any, timeout: float = 0.0) -> Any:
         """Return what an action answers.
 
         It is asked in the thread that hears it: rclpy takes an answer that is quicker than the note of the question
@@ -288,24 +267,52 @@ class Gripper:
     def __init__(self, ros: Ros, node: str) -> None:
         self.ros = ros
         self.node = node
-        self._action = f"{node.rpartition('/')[0]}/grip"
         values = ros.parameters(node)
         known = {f.name for f in dataclasses.fields(GripperParameters)}
-        law = build(GripperParameters, {n: v for n, v in values.items() if n in known}, node)
-        self.narrowest, self.widest = reach(law)
-        """Openings (m) within which it moves."""
+        self.law = build(GripperParameters, {n: v for n, v in values.items() if n in known}, node)
+        """Its geometry and limits."""
+        # An action client stays: one that is destroyed while the thread waits for it ends the thread.
+        self._grip = ActionClient(ros.node, Grip, f"{node.rpartition('/')[0]}/grip")
 
-    def move(self, opening: float, speed: float = 0.0, max_force: float = 0.0) -> Grip.Result:
-        """Go to an opening (m), pushing with `max_force` (N) at most; 0 for speed and force: the gripper's own.
+    def move(
+        self,
+        opening: float,
+        speed: float = 0.0,
+        max_force: float = 0.0,
+        on_feedback: Callable[[Grip.Feedback], None] = lambda _: None,
+        timeout: float = 120.0,
+    ) -> Grip.Result:
+        """Bring the fingers to an opening, or stop at a force; return how it ended.
 
         A gripper that has just been started is waited for until it has met its fingers.
+
+        Parameters
+        ----------
+        opening, speed, max_force : m, m/s and N; 0 for speed and force: the gripper's own
+        on_feedback : called with opening and force on the way
+        timeout : s; when it is over the goal is canceled, and the fingers hold where they are
         """
+        try:
+            check_goal(self.law, opening, max_force, speed)
+        except ValueError as error:
+            raise ClientError(f"'{self.node}': {error}") from None
         self.ros.wait(lambda: self._problem() == "", lambda: f"'{self.node}': {self._problem()}")
-        return self.ros.grip(opening, max_force, speed, self._action)
+        self.ros.wait(self._grip.server_is_ready, lambda: f"'{self.node}' has no action 'grip'")
+        goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
+        handle = self.ros.ask(
+            self.node, self._grip.send_goal_async, goal, lambda m: on_feedback(m.feedback)
+        )
+        if not handle.accepted:
+            raise ClientError(f"'{self.node}' refuses this goal; its log says why")
+        try:
+            return self.ros.ask(self.node, handle.get_result_async, timeout=timeout).result
+        except BaseException:
+            handle.cancel_goal_async()
+            raise
 
     def grasp(self, force: float, speed: float = 0.0) -> Grip.Result:
         """Close until both tips push with `force` (N), and hold that; ClientError where nothing is in between."""
-        result = self.move(self.narrowest, speed, force)
+        result = self.move(reach(self.law)[0], speed, force)
         if not result.stalled or math.isnan(result.force):
             raise ClientError(
                 f"'{self.node}' has grasped nothing: it is at an opening of {result.opening * 1e6:.2f} µm, force "
@@ -313,16 +320,16 @@ class Gripper:
             )
         return result
 
+    def release(self, speed: float = 0.0) -> Grip.Result:
+        """Go to the widest opening."""
+        return self.move(reach(self.law)[1], speed)
+
     def _problem(self) -> str:
         """Return what keeps the gripper from moving, as it says on `/diagnostics`."""
         status = self.ros.diagnostics.get(self.node)
         if status is None:
             return "silent on '/diagnostics'"
         return "" if status.level == DiagnosticStatus.OK else status.message
-
-    def release(self, speed: float = 0.0) -> Grip.Result:
-        """Go to the widest opening."""
-        return self.move(self.widest, speed)
 
 
 class Finger:

@@ -35,7 +35,6 @@ from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, flatten
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
-from piezo_control.sequence import FIRST, NEW
 from piezo_control.touch import Touch
 from piezo_gripper_msgs.msg import Sample
 
@@ -59,7 +58,6 @@ class FeedbackNode(BlockNode):
         self.expected = Sample()
         self._expected_at = -math.inf
         self._expectations: Subscription | None = None
-        self._waiting: Sample | None = None  # for what is expected of it
         self._file = ""
         self._loading = False
         self._take_file()
@@ -122,7 +120,6 @@ class FeedbackNode(BlockNode):
         super().start()
         self.restart()
         p = self.parameters
-        self._waiting = None
         if p.force_control:
             self.expected = Sample()
             self._expected_at = -math.inf
@@ -184,11 +181,6 @@ class FeedbackNode(BlockNode):
         figures |= {"controller": p.name, "certified": p.certified}
         if p.force_control:
             figures |= {"controller": "force control", "certified": False, "push": self.touch.push}
-            if self._waiting:
-                wrong = wrong or (
-                    f"sample {self._waiting.number} waits for '{self.resolve_topic_name('expected')}': runs "
-                    "'feedforward' with `compensator: sensorless`?"
-                )
         return wrong, figures
 
     def _on_expected(self, expected: Sample) -> None:
@@ -201,20 +193,17 @@ class FeedbackNode(BlockNode):
             return
         self.expected = expected
         self._expected_at = time.monotonic()
-        if self._waiting:
-            self._on_sample(self._waiting)
+        self.go_on()
 
-    def _on_sample(self, sample: Sample) -> None:
-        """Let a sample in lock-step wait for what is expected of it; sample 0 is that of a finger at rest."""
-        self._waiting = None
-        if self._expectations and self.parameters.mode == "lockstep":
-            kind = self.sequence.classify(sample.number)
-            if kind == NEW and self.expected.number != sample.number:
-                self._waiting = sample
-                return
-            if kind == FIRST:
-                self.expected = Sample()
-        super()._on_sample(sample)
+    def prepare(self, sample: Sample) -> str:
+        """See to what is expected of this sample; sample 0 is that of a finger at rest."""
+        if not self.parameters.force_control:
+            return ""
+        if sample.number == 0:
+            self.expected = Sample()
+        if self.expected.number == sample.number:
+            return ""
+        return self._expectation()
 
     def compute(self, sample: Sample, answer: Sample) -> bool:
         self.deflection = sample.value
@@ -225,20 +214,29 @@ class FeedbackNode(BlockNode):
         answer.by_controller = self._has_a_rate()
         if not p.force_control:
             answer.value = self.law.step(reference, sample.value)
-            # A reference that passes through and is the end of the range is not limited.
-            at_end = not p.command_low < answer.value < p.command_high
-            answer.limited = at_end and (answer.by_controller or answer.value != reference)
-            return True
-        if not self._is_expected():
+        elif self._is_expected():
+            answer.value = self.touch.step(
+                reference, sample.value, self.expected.value, self.reference.max_force
+            )
+            self._tell_push(sample)
+        else:
             return False
-        answer.value = self.touch.step(
-            reference, sample.value, self.expected.value, self.reference.max_force
-        )
+        # A reference that passes through and is the end of the range is not limited.
+        at_end = not p.command_low < answer.value < p.command_high
+        answer.limited = at_end and (answer.by_controller or answer.value != reference)
+        return True
+
+    def _tell_push(self, sample: Sample) -> None:
+        """Tell the push of the object, not at every sample."""
         if sample.number % max(1, round(PUSH_PERIOD / self.parameters.sample_time)) == 0:
             push = Sample(header=sample.header, number=sample.number, period=PUSH_PERIOD)
             push.value = self.touch.push
             self.pushes.publish(push)
-        return True
+
+    def _expectation(self) -> str:
+        """Return in words whose deflection is expected, and by whom."""
+        topic = self.resolve_topic_name("expected")
+        return f"'{topic}': runs 'feedforward' with `compensator: sensorless`?"
 
     def _is_expected(self) -> bool:
         """Say whether what is expected is known: in lock-step it is, running free it may be too old."""
@@ -250,8 +248,7 @@ class FeedbackNode(BlockNode):
         age, limit = now - self._expected_at, self.parameters.age_limit
         if age > limit:
             self.trip(
-                f"'expected' has not come for {age:.2g} s, must come within {limit:g} s: runs 'feedforward' with "
-                "`compensator: sensorless`?"
+                f"no news for {age:.2g} s, must be within {limit:g} s, of {self._expectation()}"
             )
         return age <= limit
 

@@ -60,7 +60,6 @@ class FeedforwardNode(BlockNode):
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
-        self._waiting: Sample | None = None  # for its temperature
         self._subscription: Subscription | None = None
         self._complained = ""
         self._build(self.parameters.rest)
@@ -81,7 +80,6 @@ class FeedforwardNode(BlockNode):
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures.clear()
-        self._waiting = None
         if self.parameters.compensator == "sensorless":
             self._subscription = self.create_subscription(
                 Temperature, "temperature", self._on_temperature, SAMPLE
@@ -123,28 +121,25 @@ class FeedforwardNode(BlockNode):
             if self._temperatures and place <= max(self._temperatures):
                 self._temperatures.clear()  # a new run, or once more from the present instant on
             self._temperatures[place] = degc
-            if self._waiting:
-                self._on_sample(self._waiting)
+            self.go_on()
 
     def _is_on_grid(self) -> bool:
         p = self.parameters
         return p.temperature_lockstep and p.mode == "lockstep"
 
-    def _on_sample(self, sample: Sample) -> None:
-        """Let a sample in lock-step wait for its temperature."""
+    def prepare(self, sample: Sample) -> str:
+        """Take up the temperature of this sample."""
         p, number = self.parameters, sample.number
-        is_new = number == 0 or number >= self.sequence.next
-        if self.active and self._subscription and self._is_on_grid() and is_new:
-            place = grid_index(number, p.sample_time, p.temperature_period)
-            if place not in self._temperatures:
-                self._waiting = sample
-                return
-            self._waiting = None
-            if number == 0:
-                self.thermometer = Thermometer(p.thermometer, 0.0)
-            self.thermometer.hear(self._temperatures[place], number * p.sample_time)
-            self._temperatures = {n: t for n, t in self._temperatures.items() if n >= place}
-        super()._on_sample(sample)
+        if p.compensator != "sensorless" or not p.temperature_lockstep:
+            return ""
+        place = grid_index(number, p.sample_time, p.temperature_period)
+        if place not in self._temperatures:
+            return "its temperature"
+        if number == 0:
+            self.thermometer = Thermometer(p.thermometer, 0.0)
+        self.thermometer.hear(self._temperatures[place], number * p.sample_time)
+        self._temperatures = {n: t for n, t in self._temperatures.items() if n >= place}
+        return ""
 
     def _read(self, law: Sensorless, now: float) -> float:
         """Return the temperature (°C), NaN for one that cannot be believed, and say so once."""
@@ -209,8 +204,6 @@ class FeedforwardNode(BlockNode):
                 "expected deflection": self.law.predicted,
             }
             wrong = wrong or self.thermometer.wrong
-            if self._waiting:
-                wrong = wrong or f"sample {self._waiting.number} waits for its temperature"
         return wrong, figures
 
     def reset(self) -> None:

@@ -159,8 +159,8 @@ def record(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
 def grip(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     """Bring a gripper to an opening or a force; 1 if it came to neither."""
     a = arguments
-    goal = (a.um * 1e-6, a.force_mn * 1e-3, a.speed_um_s * 1e-6)
-    result = ros.grip(*goal, gripper=a.action, timeout=a.seconds)
+    goal = (a.um * 1e-6, a.speed_um_s * 1e-6, a.force_mn * 1e-3)
+    result = ros.gripper(a.gripper).move(*goal, timeout=a.seconds)
     how = "there" if result.reached_goal else "stopped before" if result.stalled else "given up"
     console.print(
         f"{how}: opening {result.opening * 1e6:.2f} µm, force {result.force * 1e3:.3f} mN"
@@ -340,7 +340,9 @@ def parse(words: list[str]) -> argparse.Namespace:
     gripping.add_argument(
         "--speed-um-s", type=positive, default=0.0, metavar="UM/S", help="the gripper's"
     )
-    gripping.add_argument("--action", default="/grip", metavar="NAME", help="(/grip)")
+    gripping.add_argument(
+        "--gripper", default="/", metavar="NAMESPACE", help="of the gripper, where it has one"
+    )
     gripping.add_argument(
         "--seconds", type=positive, default=120.0, metavar="S", help="at most (120)"
     )

@@ -2,7 +2,8 @@
 """Starts a whole simulated gripper: two fingers, the gripper in front of them, and a recorder for each finger.
 
 What the nodes say comes out here. Ctrl-C ends all of them, with the fingers at rest; so does the end of any one.
-A recorder waits until it is told to record, as by `fingerctl record on`.
+A recorder waits until it is told to record, as by `fingerctl record on`. The fingers hold a force, without a force
+sensor; with --controller they hold a position instead, and feel nothing.
 
 Exit code: 0 ended by a signal, 1 a node ended by itself, 2 unusable arguments.
 """
@@ -16,22 +17,23 @@ from piezo_control.feedback import read_controller
 from piezo_control.nodes import spin
 from piezo_control.parameters import ParameterError
 from piezo_sim.experiment.on_nodes.processes import NodeDied, NodeProcesses
+from piezo_sim.plant.cantilever import CantileverParameters
 
 SIDES = ("left", "right")
+FEELING = {"force_control": "true", "compensator": "sensorless", "temperature_lockstep": "true"}
 
 
 def main() -> int:
     """Run the processes and return the exit code."""
     arguments = parse()
     try:
-        controller = read_controller(arguments.controller)
+        finger = of_finger(arguments.controller)
     except ParameterError as error:
         print(f"gripper_stack: {error}", file=sys.stderr)
         return 2
-    namespace = "/" + arguments.namespace.strip("/")
     stop = spin.stop_event()
     try:
-        with NodeProcesses(commands(arguments, namespace, controller.sample_time)) as nodes:
+        with NodeProcesses(commands(arguments, finger)) as nodes:
             while not stop.wait(0.1):
                 nodes.check()
     except NodeDied as error:
@@ -40,26 +42,27 @@ def main() -> int:
     return 0
 
 
-def commands(
-    arguments: argparse.Namespace, namespace: str, sample_time: float
-) -> dict[str, list[str]]:
+def of_finger(controller: str) -> dict[str, str]:
+    """Return the ROS parameters of a finger that holds a position by `controller`; empty: a force."""
+    if not controller:
+        return {"sample_time": str(CantileverParameters.sample_time), **FEELING}
+    # Nodes at other sample times than the controller's refuse the loop.
+    sample_time = read_controller(controller).sample_time
+    return {"sample_time": str(sample_time), "controller_file": controller}
+
+
+def commands(arguments: argparse.Namespace, finger: dict[str, str]) -> dict[str, list[str]]:
     """Return the processes by name, and what they are started with."""
+    namespace = "/" + arguments.namespace.strip("/")
     files = [word for path in arguments.params for word in ("--params-file", path)]
     found = {}
     for side in SIDES:
         here = ["--ros-args", "-r", f"__ns:={namespace.rstrip('/')}/{side}"]
-        finger = [*here, "-p", f"controller_file:={arguments.controller}"]
-        # Nodes at other sample times than the controller's refuse the loop.
-        finger += ["-p", f"sample_time:={sample_time}", *files]
-        found[f"{side}/finger"] = finger
+        given = [word for item in finger.items() for word in ("-p", ":=".join(item))]
+        found[f"{side}/finger"] = [*here, *given, *files]
         found[f"{side}/recorder"] = [*here, "-p", "autostart:=false"]
-    found["gripper"] = [
-        "--ros-args",
-        "-r",
-        f"__ns:={namespace}",
-        "-p",
-        f"sample_time:={sample_time}",
-    ]
+    gripper = ["-r", f"__ns:={namespace}", "-p", f"sample_time:={finger['sample_time']}"]
+    found["gripper"] = ["--ros-args", *gripper]
     return found
 
 
@@ -69,7 +72,10 @@ def parse() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--controller", default="robust", metavar="NAME", help="shipped name or file (robust)"
+        "--controller",
+        default="",
+        metavar="NAME",
+        help="hold a position by it: shipped name or file",
     )
     parser.add_argument(
         "--namespace", default="/", metavar="NAME", help="of the gripper; fingers are below it"
