@@ -445,6 +445,14 @@ def test_own_parameters_apply_the_voltage_that_was_asked_for(tmp_path):
     assert (voltage.min(), voltage.max()) == pytest.approx((-40.0, 40.0), abs=1e-3)
 
 
+def test_a_parameter_file_that_its_node_refuses_is_named(tmp_path):
+    (tmp_path / "feedforward.yaml").write_text("/**/feedforward: {ros__parameters: {gain: 1e-6}}")
+    with pytest.raises(
+        ParameterError, match=f"{tmp_path}/feedforward.yaml: unknown parameter 'gain'"
+    ):
+        read_experiment("hysteresis", {"params": tmp_path})
+
+
 def test_profile_names_what_is_wrong():
     with pytest.raises(ParameterError, match="here: shape is 'square'"):
         profile({"shape": "square"}, "um", "here")

@@ -145,6 +145,13 @@ def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, argument
     assert message in capsys.readouterr().err
 
 
+def test_only_the_asked_part_of_a_recording_is_used(identify, tmp_path):
+    """From 5 to 25 s of the p885 recording: 4000 rows."""
+    assert identify("hysteresis", P885, *P885_COLUMNS, "--start", 5, "--end", 25) == 0
+    fits = json.loads((tmp_path / "identified" / "hysteresis.json").read_text())
+    assert "all 3600 samples, fitted" in fits  # without the 400 to skip
+
+
 def test_nothing_is_replaced_unasked_and_no_bad_fit_is_written(identify, tmp_path, capsys):
     time = 0.005 * np.arange(400)
     voltage = 30.0 * np.sin(2.0 * np.pi * time)

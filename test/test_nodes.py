@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import Temperature
 
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
@@ -481,3 +482,25 @@ def test_recorder_refuses_an_existing_folder(neighbour, tmp_path):
         assert neighbour.change_state("recorder", Transition.TRANSITION_CONFIGURE)
         assert not neighbour.change_state("recorder", Transition.TRANSITION_ACTIVATE)
     assert "exists; name a new folder" in (tmp_path / "recorder.log").read_text()
+
+
+def test_a_temperature_log_that_cannot_be_replayed_is_refused_and_ends_nothing(neighbour, tmp_path):
+    """At activation by file, column and row; one that breaks under way deactivates the node."""
+    log = tmp_path / "log.csv"
+    log.write_text("time,temperature\n0,22\n1,warm\n")
+    replay = ("profile:=replay", f"file:={log}", "mode:=free_running", "period:=0.01")
+    arguments = ["--ros-args", *(word for value in replay for word in ("-p", value))]
+    with NodeProcesses({"temperature": arguments}, tmp_path) as processes:
+        heard = neighbour.listen(Temperature, "temperature")
+        assert not neighbour.change_state("temperature", Transition.TRANSITION_ACTIVATE)
+        said = (tmp_path / "temperature.log").read_text()
+        assert "not activated: " in said
+        assert "log.csv: column 'temperature', row 3 is 'warm', must be a finite number" in said
+        log.write_text("\ufefftime;temperature\n0,0;22,5\n\n# later\n1,0;22,5\n")
+        assert neighbour.change_state("temperature", Transition.TRANSITION_ACTIVATE)
+        neighbour.wait(lambda: heard)
+        assert heard[0].temperature == 22.5
+        log.unlink()
+        neighbour.wait(lambda: "deactivates: " in (tmp_path / "temperature.log").read_text())
+        assert not neighbour.change_state("temperature", Transition.TRANSITION_ACTIVATE)
+        processes.check()

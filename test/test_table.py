@@ -103,6 +103,20 @@ def test_columns_by_number_and_by_a_part_of_the_name(tmp_path):
         read_measurement(path, {**columns, "voltage": "0"})
 
 
+def test_a_table_without_names_has_its_columns_in_order(tmp_path):
+    """Time, voltage, deflection, nothing else; the deflection in what a finger can move."""
+    path = tmp_path / "a.csv"
+    for scale, unit in ((1e6, "um"), (1e3, "mm"), (1.0, "m")):
+        rows = (f"{0.1 * k};{k % 7};{2e-6 * scale * k:.9f};".replace(".", ",") for k in range(60))
+        path.write_text("\n".join(rows))
+        found = read_measurement(path)
+        np.testing.assert_allclose(found.deflection, 2e-6 * np.arange(60), atol=1e-9)
+        assert f"deflection = column '2' [{unit}]" in found.description
+    path.write_text("0;1;2;3\n" * 60)
+    with pytest.raises(MeasurementError, match="no column for 'voltage'; the file has 0, 1, 2, 3"):
+        read_measurement(path)
+
+
 def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     path = tmp_path / "a.csv"
     rows = [f"{0.1 * k:.1f},{k % 7},{2 * k}" for k in range(200)]

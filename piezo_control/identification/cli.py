@@ -157,7 +157,7 @@ def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify D(s) from a step or a sweep of the voltage; update cantilever.yaml."""
-    measurement = window(read(arguments.recording, arguments), arguments).bridged()
+    measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("voltage")
     stored = arguments.out / "feedforward.yaml"
     drive = measurement.voltage
@@ -168,7 +168,7 @@ def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify the elastic constant from a step of the tip force; update cantilever.yaml."""
-    measurement = window(read(arguments.recording, arguments), arguments).bridged()
+    measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("tip_force")
     if np.ptp(measurement.voltage) > 0.0:
         k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
@@ -267,7 +267,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 
 def read(path: Path, arguments: argparse.Namespace) -> Measurement:
-    """Read one recording with the columns and units of the command line."""
+    """Read one recording, or its part, with the columns and units of the command line."""
     columns, sample_time = chosen_columns(arguments, QUANTITIES)
     measurement = read_measurement(
         path,
@@ -281,11 +281,6 @@ def read(path: Path, arguments: argparse.Namespace) -> Measurement:
     if arguments.reversed:
         print(f"{path}: deflection read with its sign reversed")
         measurement = replace(measurement, deflection=-measurement.deflection)
-    return measurement
-
-
-def window(measurement: Measurement, arguments: argparse.Namespace) -> Measurement:
-    """Return the part of a measurement between --start and --end."""
     time = measurement.time - measurement.time[0]
     begin, end = np.searchsorted(time, (arguments.start, arguments.end))
     return measurement.part(slice(int(begin), int(end)))
@@ -363,18 +358,20 @@ def parse() -> argparse.Namespace:
     reading.add_argument(
         "--out", "-o", type=Path, default=Path("out/identified"), help="folder (out/identified)"
     )
-    part = argparse.ArgumentParser(add_help=False)
-    part.add_argument("--start", type=float, default=0.0, metavar="S", help="use from here on")
-    part.add_argument("--end", type=float, default=np.inf, metavar="S", help="use up to here")
+    reading.add_argument("--start", type=float, default=0.0, metavar="S", help="use from here on")
+    reading.add_argument("--end", type=float, default=np.inf, metavar="S", help="use up to here")
 
     parser = argparse.ArgumentParser(
         prog="identify", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(required=True, metavar="WHAT")
 
-    def command(function, several: bool = False, parents=(reading,)) -> argparse.ArgumentParser:
+    def command(function, several: bool = False) -> argparse.ArgumentParser:
         added = commands.add_parser(
-            function.__name__, parents=parents, help=function.__doc__, description=function.__doc__
+            function.__name__,
+            parents=[reading],
+            help=function.__doc__,
+            description=function.__doc__,
         )
         added.add_argument("recording", type=Path, nargs="+" if several else None)
         added.set_defaults(run=function)
@@ -401,8 +398,8 @@ def parse() -> argparse.Namespace:
         "--hold-back", type=share, default=0.3, metavar="SHARE", help="of the samples (0.3)"
     )
     command(check).add_argument("--skip", type=int, metavar="SAMPLES", help="not judged")
-    command(dynamics, parents=(reading, part))
-    command(stiffness, parents=(reading, part))
+    command(dynamics)
+    command(stiffness)
     command(drift, several=True)
     return parser.parse_args()
 

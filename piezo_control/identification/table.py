@@ -171,7 +171,8 @@ def read_columns(
     ----------
     path : path of the file
     quantities : the units that each may have, the first of them where nothing says which; time among them
-    columns : where to find a quantity that has another name, see :meth:`Table.find`
+    columns : where to find a quantity that has another name, see :meth:`Table.find`; for a table without names
+        that has just the columns that are needed, time first, nothing has to be said
     needed : quantities that have to be there, beside the time
     sample_time : time between rows (s); it takes the place of the column with the time
 
@@ -179,18 +180,18 @@ def read_columns(
     column and row.
     """
     table = read_table(path)
+    if table.headers == _numbered(len(table.headers)) and not columns:
+        wanted = ["time", *needed] if sample_time is None else needed
+        columns = _in_order(table, wanted, quantities)
     found = {q: table.find(q, columns.get(q), units) for q, units in quantities.items()}
     if sample_time is not None:
         found["time"] = None
+    has = f"the file has {', '.join(table.headers)}: say which column it is"
     for quantity in needed:
         if found[quantity] is None:
-            raise TableError(
-                f"{path}: no column for '{quantity}'; the file has {', '.join(table.headers)}"
-            )
+            raise TableError(f"{path}: no column for '{quantity}'; {has}")
     if found["time"] is None and sample_time is None:
-        raise TableError(
-            f"{path}: no column for 'time' and no sample time given; the file has {', '.join(table.headers)}"
-        )
+        raise TableError(f"{path}: no column for 'time' and no sample time given; {has}")
     places = {quantity: place for quantity, place in found.items() if place}
     values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
     if sample_time is not None:
@@ -220,6 +221,24 @@ def read_columns(
         table.rows[~empty],
         f"read {(~empty).sum():,} rows {table.form}: {', '.join(words)}{left_out}",
     )
+
+
+def _in_order(
+    table: Table, wanted: Sequence[str], quantities: Mapping[str, tuple[str, ...]]
+) -> dict[str, str]:
+    """Return where the `wanted` quantities are in a table without names: in this order, if no column is left.
+
+    A deflection is in the largest unit in which a finger moves that far.
+    """
+    filled = np.flatnonzero(table.cells.notna().any())
+    if len(filled) != len(wanted):
+        return {}
+    places = {quantity: str(i) for quantity, i in zip(wanted, filled)}
+    if "deflection" in places:
+        stroke = np.ptp(np.nan_to_num(table.numbers(int(places["deflection"]))))
+        possible = [u for u in quantities["deflection"] if stroke * UNITS[u] <= LARGEST_DEFLECTION]
+        places["deflection"] += f":{possible[0]}" if possible else ""
+    return places
 
 
 def read_table(path: str | Path) -> Table:
@@ -299,7 +318,7 @@ def _headings(cells: pd.DataFrame, decimal: str) -> tuple[list[str], list[str], 
 
     first = words(0)
     if not are_words(first) or _is_date(first[0]):
-        return [str(i) for i in range(len(first))], [""] * len(first), 0
+        return _numbered(len(first)), [""] * len(first), 0
     units = [split_name(header)[1] for header in first]
     if len(cells) > 1:
         second = words(1)
@@ -307,6 +326,11 @@ def _headings(cells: pd.DataFrame, decimal: str) -> tuple[list[str], list[str], 
             found = [unit_of(entry) for entry in second]
             return first, [u if u in UNITS else unit for u, unit in zip(found, units)], 2
     return first, units, 1
+
+
+def _numbered(columns: int) -> list[str]:
+    """Return what stands for the names in a table without any."""
+    return [str(i) for i in range(columns)]
 
 
 def _is_date(text: str) -> bool:

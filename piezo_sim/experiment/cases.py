@@ -168,10 +168,15 @@ class Case:
 def own_parameters(folder: Path | None, node: str) -> dict[str, Any]:
     """Return what `folder`/NODE.yaml gives to a node; nothing where there is none.
 
-    The finger of the paper needs no file: it is the default of every parameter.
+    The finger of the paper needs no file: it is the default of every parameter. Raises ParameterError naming
+    the file that the node would not load.
     """
     path = folder / f"{node}.yaml" if folder else None
-    return load(path, node) if path and path.exists() else {}
+    if path is None or not path.exists():
+        return {}
+    values = load(path, node)
+    build(NODES[node], values, str(path))
+    return values
 
 
 def not_covered(cases: Iterable[Case]) -> list[str]:

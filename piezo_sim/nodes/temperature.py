@@ -12,6 +12,7 @@ request to repeat. Running free, the profile follows the wall clock.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
@@ -19,6 +20,7 @@ from sensor_msgs.msg import Temperature
 from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import SAMPLE
+from piezo_control.parameters import ParameterError
 from piezo_sim.nodes.parameters import TemperatureNodeParameters
 from piezo_sim.temperature import temperature
 
@@ -35,6 +37,7 @@ class TemperatureNode(FingerNode):
         self.next = 0
 
     def start(self) -> None:
+        temperature(self.parameters, 0, 1)  # a file that cannot be replayed refuses the activation
         self.next = 0
         self.last_clock = -1.0
         if self.parameters.mode == "free_running":
@@ -64,19 +67,28 @@ class TemperatureNode(FingerNode):
     def _publish(self, end: int) -> None:
         """Publish the grid's temperatures from `self.next` up to, not including, `end`."""
         p = self.parameters
-        for index, value in enumerate(temperature(p, self.next, end - self.next), self.next):
+        for index, value in enumerate(self._ahead(end - self.next), self.next):
             message = Temperature(temperature=float(value))
             stamp = message.header.stamp
             stamp.sec, stamp.nanosec = divmod(round(index * p.period * 1e9), 10**9)
             self.temperatures.publish(message)
         self.next = max(end, self.next)
 
+    def _ahead(self, count: int) -> Iterable[float]:
+        """Return the next temperatures; none, and deactivate, where a replayed file became unusable."""
+        try:
+            return temperature(self.parameters, self.next, count)
+        except ParameterError as error:
+            self.get_logger().error(f"deactivates: {error}")
+            self.trigger_deactivate()
+            return ()
+
     def _tick(self) -> None:
-        (value,) = temperature(self.parameters, self.next, 1)
-        message = Temperature(temperature=float(value))
-        message.header.stamp = self.get_clock().now().to_msg()
-        self.temperatures.publish(message)
-        self.next += 1
+        for value in self._ahead(1):
+            message = Temperature(temperature=float(value))
+            message.header.stamp = self.get_clock().now().to_msg()
+            self.temperatures.publish(message)
+            self.next += 1
 
 
 def main() -> int:
