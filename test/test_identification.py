@@ -10,10 +10,10 @@ from piezo_control.creep import CreepParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.excitation import decaying_sine
+from piezo_control.identification.fit import quality
 from piezo_control.identification.hysteresis import (
     equal_thresholds,
     identify_hysteresis,
-    quality,
     settled,
 )
 from piezo_control.identification.measurement import Measurement, MeasurementError, read_measurement

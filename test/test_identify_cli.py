@@ -12,8 +12,11 @@ import pytest
 from piezo_control.creep import CreepParameters
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.cli import main
+from piezo_control.identification.dynamics import DynamicsModel
 from piezo_control.identification.excitation import decaying_sine
+from piezo_control.nodes.parameters import ServoNodeParameters
 from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
 from piezo_control.recording.writer import write_recording
@@ -93,6 +96,15 @@ def test_every_step_ends_in_one_cantilever_file(identify, tmp_path):
     assert found.creep == quick.creep
     comments = [line for line in path.read_text().splitlines() if line.startswith("#")]
     assert [word in "\n".join(comments) for word in ("excite", "step", "push")] == [True] * 3
+    intervals = {line.split(": ")[1]: line for line in comments if " ± " in line}
+    assert {"hysteresis.weights", "natural_frequency_hz", "denominator", "elastic_constant"} <= (
+        set(intervals)
+    )
+    frequency, width = map(float, intervals["natural_frequency_hz"].split(": ")[2].split(" ± "))
+    assert frequency == pytest.approx(666.627, abs=width + 0.01) and 0.0 < width < 0.1
+    before = sorted(path.read_text().splitlines())
+    assert identify("dynamics", stepped) == 0  # takes the place of what it found before
+    assert sorted(path.read_text().splitlines()) == before
     for picture in ("hysteresis.png", "dynamics.png", "stiffness.png"):
         assert (out / picture).stat().st_size > 10_000
 
@@ -143,6 +155,91 @@ def test_measured_actuator_from_its_file(identify, tmp_path, model, plays, limit
 def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, arguments, message):
     assert identify(*arguments) == 2
     assert message in capsys.readouterr().err
+
+
+LOOP = 30.0 * np.sin(2.0 * np.pi * np.arange(2000) / 200.0)  # V
+PAPERS = 1e6 * deflection_history(HysteresisParameters(), LOOP)  # µm
+
+
+def table(path, voltage, deflection, force=None, temperature=None, rate=200.0):
+    """Write a recording as a table with deflections in µm, forces in mN; return its path."""
+    columns = {
+        "time": np.arange(len(voltage)) / rate,
+        "voltage": voltage,
+        "deflection_um": deflection,
+    }
+    columns |= {} if force is None else {"tip_force_mN": force}
+    columns |= {} if temperature is None else {"temperature": temperature}
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("command", "less", "columns"),
+    [
+        # A loop that one play in every second cycle does not follow: twice the stroke.
+        ("hysteresis", "a straight line", (LOOP, 0.5 * LOOP * np.repeat([1.0, 0.85], 1000))),
+        # A finger that answers at once, and its sensor's slow error: nothing vibrates.
+        ("dynamics", "a finger without vibration", (LOOP, 0.5 * LOOP + 2.0 * np.sin(np.arange(2000) / 150.0))),
+        # A force that does nothing, and a knock at the table.
+        ("stiffness", "no force", (0.0 * LOOP, 5.0 * (np.arange(2000) // 8 == 78), LOOP > 0.0)),
+        # A deflection that neither creep nor heat explains.
+        (
+            "drift",
+            "a finger without creep and heat",
+            (LOOP, PAPERS + np.sin(np.arange(2000) / 50.0), None, 22.0 + 0.0 * LOOP),
+        ),
+    ],
+    ids=["hysteresis", "dynamics", "stiffness", "drift"],
+)  # fmt: skip
+def test_a_fit_that_explains_no_more_than_less_of_a_model_is_not_written(
+    identify, tmp_path, capsys, command, less, columns
+):
+    assert identify(command, table(tmp_path / "a.csv", *columns)) == 2
+    assert less in capsys.readouterr().err
+    assert not list((tmp_path / "identified").iterdir())
+
+
+def test_a_butterfly_is_not_written(identify, tmp_path, capsys):
+    """±1500 V at a ferroelectric: the deflection rises at both ends, as the public loop of 29.5 % rms."""
+    voltage = 50.0 * LOOP
+    turned = np.interp(
+        voltage - 400.0 * np.sign(np.gradient(voltage)), [-2000, 0, 2000], [9.0, 0.0, 9.0]
+    )
+    assert identify("hysteresis", table(tmp_path / "a.csv", voltage, turned)) == 2
+    assert "nothing written" in capsys.readouterr().err
+    assert not list((tmp_path / "identified").iterdir())
+
+
+def test_a_reversed_sensor_is_found_and_told_to_the_servo(identify, tmp_path, capsys):
+    """What the servo makes of the raw readings is what was fitted."""
+    raw = table(tmp_path / "raw.csv", LOOP, -0.5 * LOOP)
+    assert identify("hysteresis", raw, "--plays", 4) == 2
+    assert "the sign of the sensor is reversed; --reversed" in capsys.readouterr().err
+    assert identify("hysteresis", raw, "--plays", 4, "--reversed") == 0
+    out = tmp_path / "identified"
+    feedforward = build(FeedforwardParameters, load(out / "feedforward.yaml", "feedforward"))
+    servo = build(ServoNodeParameters, load(out / "servo.yaml", "servo"))
+    assert feedforward.static_gain == pytest.approx(0.5e-6, rel=1e-6)
+    assert servo.sensor_scale * -0.5e-6 * 30.0 == pytest.approx(feedforward.static_gain * 30.0)
+    (out / "servo.yaml").write_text("/**/servo: {ros__parameters: {sensor_scale: -2e-5}}\n")
+    assert identify("hysteresis", raw, "--plays", 4, "--reversed", "--overwrite") == 0
+    assert "with sensor_scale -2e-05: it stays" in capsys.readouterr().out
+    assert load(out / "servo.yaml", "servo") == {"sensor_scale": -2e-5}
+
+
+def test_a_reversed_sensor_is_found_in_every_step(identify, tmp_path, capsys):
+    time = np.arange(1000) * 2e-4
+    step = np.where(time < 0.01, 0.0, 20.0)
+    ringing = DynamicsModel(2.0 * np.pi * 300.0, 0.05, 0.5, 0.0, 0.0, 0).deflection(time, step)
+    stepped = table(tmp_path / "step.csv", step, -ringing, rate=5e3)
+    pushed = table(tmp_path / "push.csv", 0.0 * step, -ringing, 0.1 * step, rate=5e3)
+    warm = table(tmp_path / "warm.csv", LOOP, -0.5 * LOOP, None, 22.0 + 0.0 * LOOP)
+    for command, recording in (("dynamics", stepped), ("stiffness", pushed), ("drift", warm)):
+        assert identify(command, recording) == 2
+        assert "falls while" in capsys.readouterr().err
+    assert identify("dynamics", stepped, "--reversed") == 0
 
 
 def test_only_the_asked_part_of_a_recording_is_used(identify, tmp_path):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from piezo_control.identification.fit import noise
 from piezo_control.identification.measurement import Measurement, MeasurementError
 
 FEWEST_PER_PERIOD = 20  # samples
@@ -31,7 +32,7 @@ def static(measurement: Measurement) -> None:
     than the loop.
     """
     measurement.need_varying("voltage", "deflection")
-    _direction(measurement)
+    direction(measurement)
     _period(measurement)
     _excursion(measurement)
     for side in (1.0, -1.0):
@@ -42,6 +43,17 @@ def static(measurement: Measurement) -> None:
 
 def _refuse(measurement: Measurement, text: str) -> MeasurementError:
     return MeasurementError(f"{measurement.source}: {text}")
+
+
+def reversed_sensor(
+    measurement: Measurement, seen: str, drive: str = "voltage"
+) -> MeasurementError:
+    """Return the error about a deflection that falls while its drive rises, to be raised."""
+    return _refuse(
+        measurement,
+        f"column 'deflection' falls while '{drive}' rises ({seen}): the sign of the sensor is reversed; --reversed "
+        "reads it the other way round, and makes the servo do so",
+    )
 
 
 def _rows(measurement: Measurement, run: slice) -> str:
@@ -55,14 +67,11 @@ def _runs(true: NDArray[np.bool_]) -> list[slice]:
     return [slice(a, b) for a, b in pairs if b - a >= FEWEST_AT_THE_END]
 
 
-def _direction(measurement: Measurement) -> None:
+def direction(measurement: Measurement) -> None:
+    """Raise MeasurementError for a deflection that falls while the voltage rises."""
     correlation = float(np.corrcoef(measurement.voltage, measurement.deflection)[0, 1])
     if correlation < REVERSED:
-        raise _refuse(
-            measurement,
-            f"column 'deflection' falls while 'voltage' rises (correlation {correlation:.2f}): the sign of the "
-            "sensor is reversed; --reversed reads it the other way round, as your driver then has to",
-        )
+        raise reversed_sensor(measurement, f"correlation {correlation:.2f}")
 
 
 def _crossings(measurement: Measurement) -> NDArray[np.int64]:
@@ -85,11 +94,6 @@ def _period(measurement: Measurement) -> None:
             f"column 'voltage' has {samples:.3g} samples in a period of {samples * measurement.sample_time:.3g} s, "
             f"must be at least {FEWEST_PER_PERIOD}: sample faster, or drive slower",
         )
-
-
-def noise(values: NDArray[np.float64]) -> float:
-    """Return the standard deviation of white noise on a slow signal: by its second differences' median."""
-    return float(1.4826 * np.median(np.abs(np.diff(values, 2))) / np.sqrt(6.0))
 
 
 def _excursion(measurement: Measurement) -> None:

@@ -12,8 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +22,20 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from piezo_control.creep import CreepParameters
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
 from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
+from piezo_control.identification.confidence import Values, lines
 from piezo_control.identification.drift import identify_drift
 from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics
+from piezo_control.identification.fit import FitQuality, need, quality, straight
 from piezo_control.identification.hysteresis import (
-    FitQuality,
     HysteresisModel,
     equal_thresholds,
     identify_hysteresis,
-    quality,
     settled,
 )
 from piezo_control.identification.measurement import (
@@ -43,9 +45,15 @@ from piezo_control.identification.measurement import (
     read_measurement,
 )
 from piezo_control.parameters import ParameterError, build, dump, flatten, load
+from piezo_control.thermal import ThermalParameters
 
-LARGEST_RMS_PERCENT = 10.0
-"""Of the stroke: a straight line through a piezo actuator's loop misses by 5 to 9 %."""
+GROUPS = {
+    "hysteresis": HysteresisParameters,
+    "dynamics": DynamicsParameters,
+    "creep": CreepParameters,
+    "thermal": ThermalParameters,
+}
+"""Of the cantilever's parameters, those that are identified."""
 
 
 def main() -> int:
@@ -86,24 +94,27 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
             measurement, thresholds, dead_zones, None if lag == "identify" else lag, first, end
         )
 
-    def judge(model: HysteresisModel, samples: slice) -> FitQuality:
+    def judge(model: HysteresisModel, end: int, samples: slice) -> FitQuality:
         modelled = model.deflection(measurement.time, measurement.voltage)
-        return quality(measurement.deflection[samples], modelled[samples])
+        line = straight(measurement.deflection, measurement.voltage, fitted=slice(first, end))
+        is_line = len(thresholds) == 1 and not dead_zones
+        less = None if is_line else line[samples]
+        return quality(measurement.deflection[samples], modelled[samples], less)
 
     split = last - int(arguments.hold_back * (last - first))
     fits = {}
     if split < last:
         before = fit(split)
-        fits[f"first {split - first} samples, fitted"] = judge(before, slice(first, split))
-        fits[f"last {last - split} samples, held back"] = judge(before, slice(split, last))
+        fits[f"first {split - first} samples, fitted"] = judge(before, split, slice(first, split))
+        fits[f"last {last - split} samples, held back"] = judge(before, split, slice(split, last))
     model = fit(last)
-    fits[f"all {last - first} samples, fitted"] = judge(model, slice(first, last))
+    fits[f"all {last - first} samples, fitted"] = judge(model, last, slice(first, last))
     show(console, f"{arguments.model} hysteresis of {arguments.recording}", fits)
     modelled = model.deflection(measurement.time, measurement.voltage)
     fitted = slice(first, last)
     if hum := checks.hum(measurement.part(fitted), (measurement.deflection - modelled)[fitted]):
         console.print(f"{arguments.recording}: {hum}", soft_wrap=True)
-    need_quality(str(arguments.recording), fits)
+    need(str(arguments.recording), fits, "a straight line")
     console.print(
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
         f"smoothness {model.smoothness:g}"
@@ -113,29 +124,42 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         static_gain=float(np.ptp(measurement.deflection[first:]) / np.ptp(measurement.voltage)),
         hysteresis=model.parameters,
     )
+    found = flatten(feedforward)
+    build(FeedforwardParameters, found, str(arguments.recording))
     whole = fits[f"all {last - first} samples, fitted"]
-    comment = (
-        f"{arguments.model} hysteresis identified from {arguments.recording}: rms "
-        f"{whole.rms_percent:.3f} %, max {whole.maximum_percent:.2f} % of {whole.stroke * 1e6:.2f} um.\n"
+    comment = said(
+        "hysteresis",
+        f"{arguments.model}, identified from {arguments.recording}: rms {whole.rms_percent:.3f} %, max "
+        f"{whole.maximum_percent:.2f} % of {whole.stroke * 1e6:.2f} um",
+        {**found, "offset": model.offset, "lag": model.lag},
+        model.confidence,
+    )
+    written = update_cantilever(arguments.out, "hysteresis", comment, flatten(model.parameters))
+    dump(
+        path,
+        "feedforward",
+        found,
+        f"{comment}\n"
         "The deflection shows lag seconds late and with the offset of the sensor; both are no part of the\n"
         "operator, and the feedforward does not use them. The limits of the voltage are\n"
-        "no result of a measurement: they are the defaults until you write what your actuator stands."
+        "no result of a measurement: they are the defaults until you write what your actuator stands.",
     )
-    dump(path, "feedforward", flatten(feedforward), comment)
     with path.open("a") as file:
         yaml.safe_dump(
             {"/**/identification": {"ros__parameters": {"lag": model.lag, "offset": model.offset}}},
             file,
         )
     picture = arguments.out / "hysteresis.png"
-    plots.loops(measurement, modelled, fitted, picture)
+    plots.loops(measurement, modelled, fitted, picture, model)
     return [
         path,
-        update_cantilever(
-            arguments.out, comment.splitlines()[0], "hysteresis", flatten(model.parameters)
-        ),
+        written,
+        *([write_polarity(arguments, console)] if arguments.reversed else []),
         picture,
-        write_json(arguments.out / "hysteresis.json", {n: figures(f) for n, f in fits.items()}),
+        write_json(
+            arguments.out / "hysteresis.json",
+            {**{n: figures(f) for n, f in fits.items()}, "confidence": model.confidence},
+        ),
     ]
 
 
@@ -163,7 +187,7 @@ def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
     drive = measurement.voltage
     if stored.exists():
         drive = deflection_history(stored_hysteresis(stored), drive)
-    return finish_dynamics("dynamics", measurement, drive, arguments, console)
+    return finish_dynamics("dynamics", measurement, drive, [drive], arguments, console)
 
 
 def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
@@ -173,49 +197,67 @@ def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
     if np.ptp(measurement.voltage) > 0.0:
         k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
         raise measurement.error("voltage", k, "must be constant while the tip force changes")
-    return finish_dynamics("stiffness", measurement, measurement.tip_force, arguments, console)
+    return finish_dynamics("stiffness", measurement, measurement.tip_force, [], arguments, console)
 
 
 def finish_dynamics(
     name: str,
     measurement: Measurement,
     drive: np.ndarray,
+    less: Sequence[np.ndarray],
     arguments: argparse.Namespace,
     console: Console,
 ) -> list[Path]:
-    """Fit, show and store the response to `drive`."""
+    """Fit, show and store the response to `drive`, which has to explain more than `less` of it does."""
     model = identify_dynamics(measurement, drive)
+    if model.gain < 0.0:
+        what = "voltage" if less else "tip_force"
+        raise checks.reversed_sensor(measurement, f"gain {model.gain:.3g}", what)
     modelled = model.deflection(measurement.time, drive)
-    fit = quality(measurement.deflection, modelled)
+    fit = quality(
+        measurement.deflection,
+        modelled,
+        straight(measurement.deflection, measurement.time - measurement.time[0], *less),
+    )
     fits = {"all samples, fitted": fit}
     show(console, f"{name} of {arguments.recording}", fits)
-    need_quality(str(arguments.recording), fits)
-    found = {
+    need(str(arguments.recording), fits, "a finger without vibration" if less else "no force")
+    found: dict[str, Any] = {
         "natural_frequency_hz": model.natural_frequency / (2.0 * np.pi),
         "damping_ratio": model.damping_ratio,
         "delay_samples": delay_of(model, arguments),
         "denominator": model.denominator,
+        "gain": model.gain,
     }
     change: dict[str, Any] = {"denominator": model.denominator}
+    confidence = dict(model.confidence)
     if name == "stiffness":
-        change = {"elastic_constant": model.gain}
+        change = {"elastic_constant": found.pop("gain")}
+        confidence["elastic_constant"] = confidence.pop("gain")
     found.update(change)
-    for key, value in found.items():
-        console.print(f"{key}: {value}")
-    picture = arguments.out / f"{name}.png"
-    curve = np.column_stack((measurement.time, measurement.deflection, modelled))
-    plots.responses([(measurement.source, curve)], picture)
-    comment = (
-        f"{name} identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke."
+    for line in lines(found, confidence):
+        console.print(line, soft_wrap=True)
+    console.print(f"delay_samples: {found['delay_samples']}")
+    comment = said(
+        name,
+        f"identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke",
+        found,
+        confidence,
     )
+    written = update_cantilever(arguments.out, name, comment, change, "dynamics")
     if name != "stiffness":
         update_cantilever(
-            arguments.out, comment, "sensor", {"delay_samples": delay_of(model, arguments)}
+            arguments.out, name, comment, {"delay_samples": found["delay_samples"]}, "sensor"
         )
+    picture = arguments.out / f"{name}.png"
+    curve = np.column_stack((measurement.time, measurement.deflection, modelled))
+    plots.responses([(measurement.source, curve)], lines(found, confidence), picture)
     return [
-        update_cantilever(arguments.out, comment, "dynamics", change),
+        written,
         picture,
-        write_json(arguments.out / f"{name}.json", {**found, **figures(fit)}),
+        write_json(
+            arguments.out / f"{name}.json", {**found, "confidence": confidence, **figures(fit)}
+        ),
     ]
 
 
@@ -227,41 +269,57 @@ def delay_of(model: DynamicsModel, arguments: argparse.Namespace) -> int:
 def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify creep and thermal deflection from long recordings; update cantilever.yaml."""
     stored = arguments.out / "feedforward.yaml"
-    operator = stored_hysteresis(stored) if stored.exists() else HysteresisParameters()
+    operator = HysteresisParameters()
+    if stored.exists():
+        operator = stored_hysteresis(stored)
+    else:
+        console.print(f"no {stored}: the hysteresis is taken as that of the paper's finger")
     model = identify_drift(
         [read(path, arguments).bridged() for path in arguments.recording], operator
     )
     fits = {
-        str(path): quality(curve[:, 1], curve[:, 2])
-        for path, curve in zip(arguments.recording, model.fitted)
+        str(path): quality(curve[:, 1], curve[:, 2], less)
+        for path, curve, less in zip(arguments.recording, model.fitted, model.without)
     }
     show(console, "creep and thermal deflection", fits)
-    need_quality("creep and thermal deflection", fits)
-    found = {name: value for name, value in asdict(model).items() if name != "fitted"}
-    for key, value in found.items():
-        console.print(f"{key}: {value}")
-    picture = arguments.out / "drift.png"
-    plots.responses(list(zip(map(str, arguments.recording), model.fitted)), picture)
+    need("creep and thermal deflection", fits, "a finger without creep and heat")
+    found = {name: getattr(model, name) for name in model.confidence}
+    for line in lines(found, model.confidence):
+        console.print(line, soft_wrap=True)
     names = ", ".join(map(str, arguments.recording))
-    comment = f"Creep and thermal deflection identified from {names}."
-    written = []
+    groups = {}
     if model.creep_gain + model.creep_gain_per_degc > 0.0:
-        creep = {
+        groups["creep"] = {
             "gain": model.creep_gain,
             "gain_per_degc": model.creep_gain_per_degc,
             "times": model.creep_times,
             "shares": model.creep_shares,
         }
-        written.append(update_cantilever(arguments.out, comment, "creep", creep))
     if model.time_constant > 0.0:
-        thermal = {"sensitivity": model.sensitivity, "time_constant": model.time_constant}
-        written.append(update_cantilever(arguments.out, comment, "thermal", thermal))
+        groups["thermal"] = {"sensitivity": model.sensitivity, "time_constant": model.time_constant}
+    comment = said("drift", f"identified from {names}", found, model.confidence)
+    for name, values in groups.items():
+        build(GROUPS[name], values, f"{names}: {name}")
+    written = [
+        update_cantilever(arguments.out, "drift", comment, values, name)
+        for name, values in groups.items()
+    ]
+    picture = arguments.out / "drift.png"
+    plots.responses(
+        list(zip(map(str, arguments.recording), model.fitted)),
+        lines(found, model.confidence),
+        picture,
+    )
     return [
         *dict.fromkeys(written),
         picture,
         write_json(
             arguments.out / "drift.json",
-            {**found, "fits": {name: figures(fit) for name, fit in fits.items()}},
+            {
+                **found,
+                "confidence": model.confidence,
+                "fits": {name: figures(fit) for name, fit in fits.items()},
+            },
         ),
     ]
 
@@ -291,44 +349,74 @@ def stored_hysteresis(path: Path) -> HysteresisParameters:
     return build(FeedforwardParameters, load(path, "feedforward"), str(path)).hysteresis
 
 
-def update_cantilever(out: Path, comment: str, group: str, found: Mapping[str, Any]) -> Path:
-    """Put a `group` of parameters that was found into cantilever.yaml, keeping what is there."""
-    path = out / "cantilever.yaml"
+def said(name: str, source: str, found: Values, confidence: Values) -> str:
+    """Return what a file says of an identification: its source, and how well each value is known."""
+    texts = [
+        source,
+        "95 % intervals by the linearised model for correlated residuals, without errors of the model itself:",
+        *lines(found, confidence),
+    ]
+    return "\n".join(f"{name}: {text}" for text in texts)
+
+
+def update_cantilever(
+    out: Path, name: str, comment: str, found: Mapping[str, Any], group: str = ""
+) -> Path:
+    """Put values of a `group` that the identification `name` found into cantilever.yaml, keeping all else.
+
+    Raises ParameterError, and writes nothing, if the node would refuse them.
+    """
+    path, group = out / "cantilever.yaml", group or name
+    if group in GROUPS:
+        build(GROUPS[group], found, f"identified {group}")
     values, comments = {}, []
     if path.exists():
         values = load(path, "cantilever")
         comments = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
-    values.update({f"{group}.{name}": value for name, value in found.items()})
-    dump(path, "cantilever", values, "\n".join(dict.fromkeys([*comments, comment])))
+        comments = [line for line in comments if not line.startswith(f"{name}: ")]
+    values.update({f"{group}.{entry}": value for entry, value in found.items()})
+    dump(path, "cantilever", values, "\n".join([*comments, comment]))
     return path
 
 
-def need_quality(source: str, fits: Mapping[str, FitQuality]) -> None:
-    """Raise MeasurementError for a fit that explains too little to be written."""
-    for part, fit in fits.items():
-        if not fit.rms_percent <= LARGEST_RMS_PERCENT:
-            raise MeasurementError(
-                f"{source}: the fit explains too little ({part}: rms {fit.rms_percent:.1f} % of the stroke, "
-                f"must be at most {LARGEST_RMS_PERCENT:g} %), nothing written; look for outliers, a reversed "
-                "sign, wrong columns, or an actuator of another kind"
-            )
+def write_polarity(arguments: argparse.Namespace, console: Console) -> Path:
+    """Tell the servo that the sensor says less where the finger bends more; a scale that is there stays."""
+    path = arguments.out / "servo.yaml"
+    if path.exists():
+        scale = load(path, "servo").get("sensor_scale")
+        console.print(
+            f"{path} is there, with sensor_scale {scale}: it stays; the sensor of this recording is reversed",
+            soft_wrap=True,
+        )
+        return path
+    comment = (
+        f"polarity identified from {arguments.recording}: the sensor is reversed.\n"
+        "The scale is that of readings in m; multiply it by the m per unit of your card."
+    )
+    dump(path, "servo", {"sensor_scale": -1.0}, comment)
+    return path
 
 
 def show(console: Console, title: str, fits: dict[str, FitQuality]) -> None:
     """Print the figures of fits as a table."""
     table = Table(title=title)
-    for heading in ("", "rms µm", "max µm", "stroke µm", "rms %", "max %"):
+    for heading in ("", "rms µm", "max µm", "stroke µm", "rms %", "max %", "left %"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, fit in fits.items():
         lengths = (f"{value * 1e6:.4g}" for value in (fit.rms, fit.maximum, fit.stroke))
-        table.add_row(name, *lengths, f"{fit.rms_percent:.3f}", f"{fit.maximum_percent:.2f}")
+        left = "" if np.isnan(fit.share) else f"{100.0 * fit.share:.1f}"
+        table.add_row(name, *lengths, f"{fit.rms_percent:.3f}", f"{fit.maximum_percent:.2f}", left)
     console.print(table)
 
 
 def figures(fit: FitQuality) -> dict[str, float]:
-    """Return the figures of a fit for JSON: m and % of the stroke."""
+    """Return the figures of a fit for JSON: m, % of the stroke, share of what less of a model leaves."""
+    compared = {} if np.isnan(fit.share) else {"share": fit.share}
     return {
-        **asdict(fit),
+        "rms": fit.rms,
+        "maximum": fit.maximum,
+        "stroke": fit.stroke,
+        **compared,
         "rms_percent": fit.rms_percent,
         "maximum_percent": fit.maximum_percent,
     }

@@ -15,7 +15,8 @@ squares with creep of the voltage's sign only. Every recording has its own offse
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from scipy.optimize import least_squares, lsq_linear
 from scipy.signal import lfilter
 
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
+from piezo_control.identification.checks import direction
+from piezo_control.identification.confidence import Values, intervals
+from piezo_control.identification.fit import column_norms, straight
 from piezo_control.identification.measurement import Measurement, MeasurementError
 from piezo_control.thermal import REFERENCE_DEGC
 
@@ -44,6 +48,10 @@ class DriftModel:
     time_constant: float  # s
     gain_per_degc: float  # 1/degC, of the hysteresis
     fitted: tuple[NDArray[np.float64], ...]  # per recording: time (s), measured and modelled (m)
+    without: tuple[
+        NDArray[np.float64], ...
+    ]  # the deflection (m) of a finger without both, at those times
+    confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
 
     def creep_after_step(self, time: NDArray, voltage: float, temperature_degc: float) -> NDArray:
         """Return the creep (m) at `time` (s) after a voltage step (V) at a constant temperature."""
@@ -98,9 +106,13 @@ def identify_drift(
     Raises
     ------
     MeasurementError
-        If a recording has no temperature, or voltage and temperature are constant in all of them.
+        If a recording has no temperature, its deflection falls while the voltage rises, or voltage and
+        temperature are constant in all of them.
     """
     recordings = [_Means(m, hysteresis) for m in measurements]
+    for measurement in measurements:
+        if np.ptp(measurement.voltage) > 0.0:
+            direction(measurement)
     source = ", ".join(m.source for m in measurements)
     creeping = any(np.ptp(r.voltage) > 0.0 for r in recordings)
     warming = any(np.ptp(r.temperature) >= SMALLEST_WARMING for r in recordings)
@@ -139,8 +151,7 @@ def identify_drift(
 
     def linear(logs: NDArray, cold_share: float) -> tuple[NDArray, NDArray]:
         matrix = regressors(logs, cold_share)
-        norms = np.linalg.norm(matrix, axis=0)
-        norms[norms == 0.0] = 1.0
+        norms = column_norms(matrix)
         triangle = np.linalg.qr(np.column_stack((matrix / norms, measured)), mode="r")
         x = lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x / norms
         return x, measured - matrix @ x
@@ -152,27 +163,46 @@ def identify_drift(
     found = least_squares(
         lambda p: linear(p[:-1], p[-1])[1] / scale, np.append(start, 0.3), bounds=(low, high)
     )
-    logs, cold_share = found.x[:-1], float(found.x[-1])
-    x, deviation = linear(logs, cold_share)
-    time_constant, *times = np.exp(logs).tolist()
-    amounts = x[:RELAXATIONS]
-    total = float(np.sum(amounts))
     if not spans_temperatures:
-        cold_share, warmest = 1.0, 1.0
-    order = np.argsort(times)
-    shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
+        warmest = 1.0
+
+    def values(numbers: NDArray) -> dict[str, Any]:
+        logs, (cold_share, *x) = numbers[: RELAXATIONS + 1], numbers[RELAXATIONS + 1 :]
+        time_constant, *times = np.exp(logs).tolist()
+        amounts = np.array(x[:RELAXATIONS])
+        total = float(np.sum(amounts))
+        cold_share = float(cold_share) if spans_temperatures else 1.0
+        order = np.argsort(times)
+        shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
+        return {
+            "creep_gain": total * cold_share,
+            "creep_gain_per_degc": total * (1.0 - cold_share) / warmest,
+            "creep_times": tuple(float(times[i]) for i in order),
+            "creep_shares": tuple(float(shares[i]) for i in order),
+            "sensitivity": float(x[RELAXATIONS]) if warming else 0.0,
+            "time_constant": time_constant if warming else 0.0,
+            "gain_per_degc": float(x[RELAXATIONS + 1] / x[RELAXATIONS + 2])
+            if warming and creeping
+            else 0.0,
+        }
+
+    x, deviation = linear(found.x[:-1], float(found.x[-1]))
+    numbers = np.append(found.x, x)
+    matrix = regressors(found.x[:-1], float(found.x[-1]))
+    free = np.append((found.x > low) & (found.x < high), x > lowest)
+    searched = []
+    for step in 1e-4 * np.eye(found.x.size):
+        after, before = (regressors(p[:-1], p[-1]) for p in (found.x + step, found.x - step))
+        searched.append((after - before) @ x / (2.0 * step.sum()))
+    jacobian = np.column_stack((*searched, matrix)) * free
     ends = np.cumsum([np.sum(r.kept) for r in recordings])[:-1]
     modelled = np.split(measured - deviation, ends)
     return DriftModel(
-        creep_gain=total * cold_share,
-        creep_gain_per_degc=total * (1.0 - cold_share) / warmest,
-        creep_times=tuple(float(times[i]) for i in order),
-        creep_shares=tuple(float(shares[i]) for i in order),
-        sensitivity=float(x[RELAXATIONS]) if warming else 0.0,
-        time_constant=time_constant if warming else 0.0,
-        gain_per_degc=float(x[RELAXATIONS + 1] / x[RELAXATIONS + 2]) if warming else 0.0,
+        **values(numbers),
         fitted=tuple(
             np.column_stack((r.time[r.kept], r.deflection[r.kept], m))
             for r, m in zip(recordings, modelled)
         ),
+        without=tuple(straight(r.deflection[r.kept], r.static[r.kept]) for r in recordings),
+        confidence=intervals(values, numbers, jacobian, deviation),
     )

@@ -13,17 +13,20 @@ constant s_p, with the hysteresis operator's output it should be 1.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete, lfilter
 
+from piezo_control.identification.confidence import Values, intervals
+from piezo_control.identification.fit import column_norms
 from piezo_control.identification.measurement import Measurement, MeasurementError
 
 FREQUENCIES = 150  # tried before the search, from one cycle in the measurement to Nyquist
 LONGEST_DELAY = 8  # samples
+STEP = 1e-6  # relative, of a derivative
 DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
 
 
@@ -37,12 +40,12 @@ class DynamicsModel:
     offset: float  # m
     slope: float  # m/s
     delay_samples: int  # from the drive to the deflection, beyond how they are paired
+    confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
 
     @property
     def denominator(self) -> tuple[float, float, float]:
         """Coefficients a2, a1, 1 of D(s), highest power first."""
-        w = self.natural_frequency
-        return 1.0 / w**2, 2.0 * self.damping_ratio / w, 1.0
+        return _denominator(self.natural_frequency, self.damping_ratio)
 
     def deflection(self, time: ArrayLike, drive: ArrayLike) -> NDArray[np.float64]:
         """Return the deflection (m) at evenly spaced `time` (s) from rest at drive[0]."""
@@ -56,9 +59,13 @@ class DynamicsModel:
         return self.gain * response + self.offset + self.slope * (time - time[0])
 
 
+def _denominator(frequency: float, damping: float) -> tuple[float, float, float]:
+    return 1.0 / frequency**2, 2.0 * damping / frequency, 1.0
+
+
 def _respond(frequency: float, damping: float, drive: NDArray, sample_time: float) -> NDArray:
     """Return D(s) drive at the ends of the intervals over which the drive is held, from rest."""
-    continuous = ([1.0], [1.0 / frequency**2, 2.0 * damping / frequency, 1.0])
+    continuous = ([1.0], _denominator(frequency, damping))
     numerator, denominator, _ = cont2discrete(continuous, sample_time, method="zoh")
     # The drive of sample k is held before sample k: the delay that zoh puts in is not there.
     change = drive - drive[0]
@@ -93,12 +100,15 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
     time = measurement.time - measurement.time[0]
     columns = np.column_stack((np.ones_like(time), time))
 
-    def linear(frequency: float, damping: float, delay: int) -> tuple[NDArray, NDArray]:
+    def regressors(frequency: float, damping: float, delay: int) -> NDArray:
         response = _respond(frequency, damping, _delayed(drive, delay), sample_time)
-        regressors = np.column_stack((response, columns))
-        scale = np.linalg.norm(regressors, axis=0)
-        x = np.linalg.lstsq(regressors / scale, measurement.deflection, rcond=None)[0] / scale
-        return x, measurement.deflection - regressors @ x
+        return np.column_stack((response, columns))
+
+    def linear(frequency: float, damping: float, delay: int) -> tuple[NDArray, NDArray]:
+        matrix = regressors(frequency, damping, delay)
+        scale = column_norms(matrix)
+        x = np.linalg.lstsq(matrix / scale, measurement.deflection, rcond=None)[0] / scale
+        return x, measurement.deflection - matrix @ x
 
     nyquist = math.pi / sample_time
     start = min(
@@ -126,5 +136,24 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
             f"{measurement.source}: no vibration below the Nyquist frequency of "
             f"{0.5 / sample_time:g} Hz; sample faster"
         )
-    gain, offset, slope = linear(frequency, damping, delay)[0].tolist()
-    return DynamicsModel(frequency, damping, gain, offset, slope, delay)
+    x, residual = linear(frequency, damping, delay)
+    fitted = np.concatenate(([frequency, damping], x))
+    here = regressors(frequency, damping, delay)
+    moved = (
+        regressors((1.0 + STEP) * frequency, damping, delay),
+        regressors(frequency, (1.0 + STEP) * damping, delay),
+    )
+    by_vibration = [(m - here) @ x / (STEP * v) for m, v in zip(moved, (frequency, damping))]
+    jacobian = np.column_stack((*by_vibration, here))
+
+    def values(numbers: NDArray) -> Values:
+        return {
+            "natural_frequency_hz": numbers[0] / (2.0 * math.pi),
+            "damping_ratio": numbers[1],
+            "denominator": _denominator(numbers[0], numbers[1]),
+            "gain": numbers[2],
+        }
+
+    confidence = intervals(values, fitted, jacobian, residual)
+    gain, offset, slope = x.tolist()
+    return DynamicsModel(frequency, damping, gain, offset, slope, delay, confidence)

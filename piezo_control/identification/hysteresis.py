@@ -18,7 +18,7 @@ Rayleigh's law, which is what extrapolates best to other amplitudes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,7 @@ from piezo_control.hysteresis import (
     invert,
     play_history,
 )
+from piezo_control.identification.confidence import Values, intervals
 from piezo_control.identification.measurement import Measurement, MeasurementError
 
 SMALLEST_SLOPE = 0.05  # of the dead zones, relative to the middle
@@ -51,40 +52,12 @@ class HysteresisModel:
     offset: float  # m, what the sensor shows where the operator says 0
     lag: float  # s, by which the sensor shows a deflection late
     smoothness: float  # penalty chosen
+    confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
 
     def deflection(self, time: ArrayLike, voltage: ArrayLike) -> NDArray[np.float64]:
         """Return what the sensor shows (m) under a voltage history (V) from rest."""
         operator = deflection_history(self.parameters, voltage)
         return self.offset + np.interp(np.asarray(time) - self.lag, time, operator)
-
-
-@dataclass(frozen=True)
-class FitQuality:
-    """Deviation of a model from a measurement."""
-
-    rms: float  # m
-    maximum: float  # m
-    stroke: float  # m, from the lowest to the highest deflection
-
-    @property
-    def rms_percent(self) -> float:
-        """Root mean square as a percentage of the stroke."""
-        return 100.0 * self.rms / self.stroke
-
-    @property
-    def maximum_percent(self) -> float:
-        """Largest deviation as a percentage of the stroke."""
-        return 100.0 * self.maximum / self.stroke
-
-
-def quality(measured: NDArray[np.float64], modelled: NDArray[np.float64]) -> FitQuality:
-    """Compare two histories of deflection (m)."""
-    deviation = measured - modelled
-    return FitQuality(
-        float(np.sqrt(np.mean(deviation**2))),
-        float(np.abs(deviation).max()),
-        float(np.ptp(measured)),
-    )
 
 
 def settled(measurement: Measurement) -> int:
@@ -149,9 +122,10 @@ def identify_hysteresis(
             f"{measurement.rows[settled(measurement)]}"
         )
     problem = _Problem(measurement, thresholds, dead_zones, first, last)
+    searched = lag is None
     if lag is None:
         lag = problem.search_lag()
-    return problem.solve(lag)
+    return problem.solve(lag, searched and lag > 0.0)
 
 
 class _Problem:
@@ -243,11 +217,14 @@ class _Problem:
 
     def least_squares(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the bounded solution of ``rows[:, :-1] x = rows[:, -1]``."""
+        return lsq_linear(rows[:, :-1], rows[:, -1], (self.lowest(), np.inf), method="bvls").x
+
+    def lowest(self) -> NDArray[np.float64]:
+        """Return the lower bounds of weights, offset, drift and slopes."""
         plays, zones = len(self.thresholds), len(self.knots)
-        lowest = np.concatenate(
+        return np.concatenate(
             ([1e-6], np.zeros(plays - 1), [-np.inf] * 2, np.full(2 * zones, SMALLEST_SLOPE))
         )
-        return lsq_linear(rows[:, :-1], rows[:, -1], (lowest, np.inf), method="bvls").x
 
     def search_lag(self) -> float:
         """Return the lag (s) with the least deviation in cross-validation, 0 if it gains too little."""
@@ -289,15 +266,56 @@ class _Problem:
             errors.append(error)
         return errors
 
-    def solve(self, lag: float) -> HysteresisModel:
+    def solve(self, lag: float, searched: bool) -> HysteresisModel:
         """Choose the smoothness by cross-validation, solve, and return to SI units."""
         parts = self.parts(lag)
         smoothness = SMOOTHNESS[np.argmin(self.cross_validation(parts, SMOOTHNESS))]
-        x = self.least_squares(np.concatenate((*parts, self.penalty(smoothness))))
-        return self._model(x, lag, smoothness)
+        penalty = self.penalty(smoothness)
+        x = self.least_squares(np.concatenate((*parts, penalty)))
+        parameters, offset = self._operator(x)
+        model = HysteresisModel(
+            parameters, offset, lag, smoothness, self._confidence(x, lag, searched, penalty)
+        )
+        measurement = self.measurement
+        deviation = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
+        return replace(model, offset=offset + float(np.mean(deviation[self.rows])))
 
-    def _model(self, x: NDArray[np.float64], lag: float, smoothness: float) -> HysteresisModel:
-        """Return to SI units, and move the dead zones' origin to where the plays sum to 0."""
+    def _confidence(
+        self, x: NDArray[np.float64], lag: float, searched: bool, penalty: NDArray[np.float64]
+    ) -> Values:
+        """Return the intervals of what the solution `x` means; of the lag, too, if it was searched."""
+        full = np.append(x, -1.0)
+        equations = self.equations(lag)
+        free = x > self.lowest()
+        step = self.measurement.sample_time
+        by_lag = (self.equations(lag + step) - self.equations(lag - step)) @ full / (2.0 * step)
+        jacobian = np.column_stack((equations[:, :-1] * free, by_lag * searched))
+        rows = np.sqrt(len(equations)) * penalty[:, :-1] * free
+        ends = self.measurement.voltage.min(), self.measurement.voltage.max()
+
+        def values(numbers: NDArray[np.float64]) -> Values:
+            parameters, offset = self._operator(numbers[:-1])
+            loop = deflection_history(parameters, [ends[0], ends[1], ends[0]])
+            found: dict[str, float | tuple[float, ...]] = {
+                "static_gain": float(np.ptp(loop[1:])) / (ends[1] - ends[0]),
+                "hysteresis.weights": parameters.weights,
+            }
+            for side in ("upper", "lower"):
+                for part in ("thresholds", "weights"):
+                    name = f"{side}_{part}"
+                    found[f"hysteresis.{name}"] = getattr(parameters, name)
+            return {**found, "offset": offset, **({"lag": float(numbers[-1])} if searched else {})}
+
+        return intervals(
+            values,
+            np.append(x, lag),
+            jacobian,
+            equations @ full,
+            np.column_stack((rows, 0.0 * rows[:, :1])),
+        )
+
+    def _operator(self, x: NDArray[np.float64]) -> tuple[HysteresisParameters, float]:
+        """Return to SI units, and move the dead zones' origin to where the plays sum to 0; the offset, too."""
         plays, zones = len(self.thresholds), len(self.knots)
         total = self.stroke * (x[plays] + x[plays + 1] * float(np.mean(self.drift)))
         # Inverse dead zones as a polygon through 0 in the middle, equal to `total` at the origin.
@@ -335,7 +353,4 @@ class _Problem:
             lower_thresholds,
             lower_weights,
         )
-        model = HysteresisModel(parameters, self.middle + origin, lag, smoothness)
-        measurement = self.measurement
-        deviation = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
-        return replace(model, offset=model.offset + float(np.mean(deviation[self.rows])))
+        return parameters, self.middle + origin

@@ -10,27 +10,60 @@ import matplotlib
 matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+from matplotlib.axes import Axes  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+from piezo_control.identification.hysteresis import HysteresisModel  # noqa: E402
 from piezo_control.identification.measurement import Measurement  # noqa: E402
 
 
-def loops(measurement: Measurement, modelled: NDArray, samples: slice, path: Path) -> None:
-    """Draw measured and modelled deflection (m) over voltage, and their difference over time."""
+def loops(
+    measurement: Measurement,
+    modelled: NDArray,
+    samples: slice,
+    path: Path,
+    model: HysteresisModel | None = None,
+) -> None:
+    """Draw measured and modelled deflection (m) over voltage, and their difference over time.
+
+    With a `model`, its weights, too, and how well they are known.
+    """
     voltage = measurement.voltage[samples]
     measured, modelled = measurement.deflection[samples] * 1e6, modelled[samples] * 1e6
-    figure, (loop, error) = plt.subplots(1, 2, figsize=(11, 4.5), constrained_layout=True)
+    panels = 2 if model is None else 3
+    figure, (loop, error, *others) = plt.subplots(
+        1, panels, figsize=(5.5 * panels, 4.5), constrained_layout=True
+    )
     loop.plot(voltage, measured, "tab:blue", lw=1.2, label="measured")
     loop.plot(voltage, modelled, "tab:orange", lw=0.7, label="modelled")
     loop.set(xlabel="voltage [V]", ylabel="deflection [µm]", title=Path(measurement.source).name)
     loop.legend()
     error.plot(measurement.time[samples], measured - modelled, lw=0.6)
     error.set(xlabel="t [s]", ylabel="measured − modelled [µm]")
+    if model is not None:
+        _weights(others[0], model)
     _finish(figure, path)
 
 
-def responses(curves: list[tuple[str, NDArray]], path: Path) -> None:
-    """Draw responses over time: per source an array of time (s), measured and modelled (m)."""
+def _weights(axis: Axes, model: HysteresisModel) -> None:
+    """Draw the plays' weights with their intervals; the first is the linear part, and much larger."""
+    thresholds, weights = model.parameters.thresholds, np.array(model.parameters.weights) * 1e6
+    widths = np.array(model.confidence["hysteresis.weights"]) * 1e6
+    axis.errorbar(thresholds[1:], weights[1:], widths[1:], fmt="o", ms=3, capsize=3)
+    axis.set(
+        xlabel="threshold [V]",
+        ylabel="weight [µm/V]",
+        title=f"weights with 95 % intervals; the first: {weights[0]:.4g} ± {widths[0]:.2g} µm/V",
+    )
+    axis.title.set_fontsize("medium")
+
+
+def responses(curves: list[tuple[str, NDArray]], found: list[str], path: Path) -> None:
+    """Draw responses over time: per source an array of time (s), measured and modelled (m).
+
+    What was `found`, with its intervals, stands above.
+    """
     figure, axes = plt.subplots(
         len(curves), 2, figsize=(11, 3.6 * len(curves)), constrained_layout=True, squeeze=False
     )
@@ -42,6 +75,7 @@ def responses(curves: list[tuple[str, NDArray]], path: Path) -> None:
         response.legend()
         error.plot(time, (measured - modelled) * 1e6, lw=0.6)
         error.set(xlabel="t [s]", ylabel="measured − modelled [µm]")
+    figure.suptitle("\n".join(["95 % intervals", *found]), fontsize="small")
     _finish(figure, path)
 
 

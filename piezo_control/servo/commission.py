@@ -39,10 +39,10 @@ from piezo_control.feedforward import FeedforwardParameters  # noqa: E402
 from piezo_control.hysteresis import deflection_history  # noqa: E402
 from piezo_control.identification.dynamics import identify_dynamics  # noqa: E402
 from piezo_control.identification.excitation import decaying_sine  # noqa: E402
+from piezo_control.identification.fit import need, quality, straight  # noqa: E402
 from piezo_control.identification.hysteresis import (  # noqa: E402
     equal_thresholds,
     identify_hysteresis,
-    quality,
 )
 from piezo_control.identification.measurement import Measurement, MeasurementError  # noqa: E402
 from piezo_control.parameters import ParameterError, dump, flatten  # noqa: E402
@@ -60,7 +60,6 @@ SWEEP = 1.0  # s
 SINE_CYCLES = 12
 ATTEMPTS = 3
 GOOD_MISSING_SHARE, LARGEST_MISSING_SHARE = 0.01, 0.1  # of the readings
-LARGEST_RMS_PERCENT = 10.0  # of the stroke, as `identify`
 
 
 class NoAnswer(RuntimeError):
@@ -220,12 +219,13 @@ def commission(
     wave = sweep(amplitude, SWEEP, a.sample_time)
     swept = bench.measure(Profile(wave.time, home + amplitude + wave.value), SWEEP)
     model = identify_dynamics(swept, swept.voltage)
-    fit = quality(swept.deflection, model.deflection(swept.time, swept.voltage))
+    static = straight(swept.deflection, swept.voltage)
+    fit = quality(swept.deflection, model.deflection(swept.time, swept.voltage), static)
     console.print(
         f"resonance {model.natural_frequency / (2.0 * math.pi):.1f} Hz, damping ratio "
         f"{model.damping_ratio:.4f}, delay {model.delay_samples} samples (rms {fit.rms_percent:.1f} %)"
     )
-    need(fit.rms_percent, "one resonance and a delay")
+    need("one resonance and a delay", {"sweep": fit}, "a finger without vibration")
     if not agree(f"decaying sine over the whole range, {low:g} to {high:g} V?"):
         return None
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -236,9 +236,9 @@ def commission(
     slow = slow.part(slice(None, None, max(1, round(1e-3 / a.sample_time))))
     hysteresis = identify_hysteresis(slow, equal_thresholds(slow, PLAYS), lag=None)
     shown = hysteresis.deflection(slow.time, slow.voltage)
-    fit = quality(slow.deflection, shown)
+    fit = quality(slow.deflection, shown, straight(slow.deflection, slow.voltage))
     console.print(f"hysteresis: rms {fit.rms_percent:.2f} % of {fit.stroke * 1e6:.3g} µm")
-    need(fit.rms_percent, "the hysteresis")
+    need("the hysteresis", {"decaying sine": fit}, "a straight line")
     # What was called zero is the finger at rest; the model's zero is a homed finger at 0 V.
     bench.zero -= float(deflection_history(hysteresis.parameters, [home])[0]) / bench.scale
     folder: Path = a.out
@@ -279,15 +279,6 @@ def commission(
     }
     dump(folder / "servo.yaml", "servo", servo, origin)
     return folder, certificate.met
-
-
-def need(rms_percent: float, what: str) -> None:
-    """Raise NoAnswer for a fit that explains too little."""
-    if not rms_percent <= LARGEST_RMS_PERCENT:
-        raise NoAnswer(
-            f"{what} explain too little: rms {rms_percent:.1f} % of the stroke, must be at most "
-            f"{LARGEST_RMS_PERCENT:g} %"
-        )
 
 
 def main() -> int:
