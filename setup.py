@@ -76,6 +76,7 @@ setup(
     ],
     extras_require={
         "cluster": ["distributed"],  # `monte_carlo --scheduler`
+        "formats": ["fastparquet", "h5py", "npTDMS", "openpyxl"],  # recordings of other instruments
         "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
         "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
         "test": [

@@ -18,6 +18,11 @@ for a design from weights (method `hinf`), nothing else does. Who gives away a p
 the GPL; a controller file that came out of it is data. The methods that need no weights (`damped_integrator`, `pid`,
 `integrator_notch`) need no slycot.
 
+Recordings of other programs are read by [h5py](https://www.h5py.org/) (HDF5, MATLAB 7.3),
+[npTDMS](https://nptdms.readthedocs.io/) (LabVIEW; LGPL-3.0), [fastparquet](https://fastparquet.readthedocs.io/) and
+[openpyxl](https://openpyxl.readthedocs.io/) (.xlsx). They are imported where such a file is read and nowhere else: an
+installation without them reads all text, `.mat` to version 7 and NumPy's files, and says what to install for the rest.
+
 The SLICOT library itself is BSD-3-Clause since version 5.7, and so is
 [ctrlsys](https://pypi.org/project/ctrlsys/), a translation of it to C with a Python face. It is young and its SB10AD has
 not been examined here; once it gives the controllers of `params/` and their gammas, it can take slycot's place in

@@ -21,7 +21,7 @@ def add_options(parser: argparse.ArgumentParser, quantities: Mapping[str, tuple[
     """Add what names the columns of a table on the command line; :func:`chosen_columns` reads it."""
     group = parser.add_argument_group(
         "tables",
-        "text, .mat, .npz or .parquet; COLUMN is a name, a part of one, or a number from 0",
+        "text, .xlsx, .mat, .h5, .tdms, .npz or .parquet; COLUMN is a name, a part of one, or a number from 0",
     )
     for quantity, units in quantities.items():
         group.add_argument(

@@ -2,8 +2,8 @@
 """Tables of numbers as instruments and spreadsheets write them: what is a name, a unit, a number is found.
 
 Text in any usual encoding, separated by tabs, semicolons, commas or blanks, with decimal points or commas,
-quoted or not, with comments, a line of names and one of units or without; MATLAB (up to version 7), NumPy and
-Parquet files with one vector for each column.
+quoted or not, with comments, a line of names and one of units or without; spreadsheets (.xlsx, the first sheet); and
+what :mod:`piezo_control.identification.arrays` reads.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from piezo_control.identification.arrays import READERS, absent, read_vectors
 from piezo_control.safety import LARGEST_DEFLECTION
 
 UNITS = {
@@ -34,7 +34,6 @@ UNITS = {
 SPELLINGS = {"µ": "u", "μ": "u", "°C": "degc", "degC": "degc", "celsius": "degc", "sec": "s"}
 COMMENTS = ("#", "%")
 LARGEST_MISSING_SHARE = 0.01  # of the rows
-BINARY = {".mat", ".npz", ".parquet"}
 
 
 class TableError(ValueError):
@@ -108,8 +107,11 @@ class Table:
             return re.sub(r"[\s_]+", " ", text).strip().lower()
 
         bases = [split_name(header)[0] for header in self.headers]
-        for names in (self.headers, bases, list(map(plain, bases))):
-            sought = plain(name) if names is not self.headers and names is not bases else name
+        alike = [plain(base) for base in bases]
+        ends = [base.rpartition(".")[2].strip() for base in alike]  # of a name within a group
+        for names, sought in (
+            (self.headers, name), (bases, name), (alike, plain(name)), (ends, plain(name)),
+        ):  # fmt: skip
             if names.count(sought) == 1:
                 return names.index(sought)
         if exact:
@@ -244,8 +246,10 @@ def _in_order(
 def read_table(path: str | Path) -> Table:
     """Read a table of numbers; raises TableError naming what cannot be read."""
     path = Path(path)
-    if path.suffix.lower() in BINARY:
-        return _read_arrays(path)
+    if path.suffix.lower() in READERS:
+        return _read_vectors(path)
+    if path.suffix.lower() == ".xlsx":
+        return _read_sheet(path)
     try:
         text = _decode(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
@@ -271,6 +275,33 @@ def read_table(path: str | Path) -> Table:
     spelled = {"\t": "tabs", r"\s+": "blanks"}.get(separator, f"'{separator}'")
     form = f"separated by {spelled}" + (", decimal commas" if decimal == "," else "")
     return Table(path, headers, units, cells.iloc[first:], rows[first:], decimal, form)
+
+
+def _read_vectors(path: Path) -> Table:
+    try:
+        vectors = read_vectors(path)
+    except ValueError as error:
+        raise TableError(f"{path}: {error}") from None
+    headers = [vector.name for vector in vectors]
+    told = [unit_of(vector.unit) for vector in vectors]
+    units = [u if u in UNITS else split_name(header)[1] for u, header in zip(told, headers)]
+    # Not by name: two of them may have the same.
+    cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
+    return Table(path, headers, units, cells, np.arange(len(cells)), form="vectors by name")
+
+
+def _read_sheet(path: Path) -> Table:
+    try:
+        cells = pd.read_excel(path, header=None, dtype=str, engine="openpyxl").dropna(how="all")
+    except ImportError:
+        raise TableError(f"{path}: cannot be read: {absent('openpyxl')}") from None
+    except Exception as error:  # of the library that takes the bytes apart, whatever they are
+        raise TableError(f"{path}: cannot be read: {error}") from None
+    if cells.empty:
+        raise TableError(f"{path}: no rows")
+    rows = cells.index.to_numpy() + 1
+    headers, units, first = _headings(cells, ".")
+    return Table(path, headers, units, cells.iloc[first:], rows[first:], form="of the first sheet")
 
 
 def _decode(data: bytes) -> str:
@@ -335,37 +366,3 @@ def _numbered(columns: int) -> list[str]:
 
 def _is_date(text: str) -> bool:
     return bool(re.match(r"\d+[-/.:]\d+", text))
-
-
-def _read_arrays(path: Path) -> Table:
-    """Read vectors by name: MATLAB, NPZ, Parquet."""
-    try:
-        arrays = _load_arrays(path)
-    except (OSError, ValueError, NotImplementedError, ImportError) as error:
-        hint = "; save it with '-v7'" if isinstance(error, NotImplementedError) else ""
-        raise TableError(f"{path}: cannot be read: {error}{hint}") from None
-    vectors = {
-        name: np.ravel(values).astype(float)
-        for name, values in arrays.items()
-        if np.ndim(values) and np.issubdtype(np.asarray(values).dtype, np.number)
-    }
-    length = max((v.size for v in vectors.values()), default=0)
-    vectors = {name: v for name, v in vectors.items() if v.size == length}
-    if not length:
-        raise TableError(f"{path}: no vectors of numbers; it has {', '.join(arrays)}")
-    headers = list(vectors)
-    units = [split_name(header)[1] for header in headers]
-    return Table(
-        path, headers, units, pd.DataFrame(vectors), np.arange(length), form="vectors by name"
-    )
-
-
-def _load_arrays(path: Path) -> Mapping[str, Any]:
-    if path.suffix.lower() == ".mat":
-        from scipy.io import loadmat
-
-        return {n: v for n, v in loadmat(path).items() if not n.startswith("__")}
-    if path.suffix.lower() == ".npz":
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    return {name: column.to_numpy() for name, column in pd.read_parquet(path).items()}
