@@ -241,6 +241,23 @@ def apply(
     return voltage
 
 
+def follow_step(
+    c: SensorlessCoefficients, s: SensorlessState, voltage: float, temperature_degc: float
+) -> float:
+    """Let the models follow a `voltage` (V) that somebody else chose; return what they expect (m) at its end."""
+    warmth = s.body.degc[0] - REFERENCE_DEGC
+    heat(c, s, temperature_degc)
+    operator_step(c.operator, s.hysteresis, voltage)
+    creep_step(c.creep, s.relaxations, voltage, warmth)
+    return expected(c, s, voltage, warmth)
+
+
+def settle(c: SensorlessCoefficients, s: SensorlessState, temperature_degc: float) -> None:
+    """Learn the temperature that the finger has been in equilibrium with since its start."""
+    s.body.degc[0] = min(max(temperature_degc, c.coldest), c.warmest)
+    s.body.degc_at_start[0] = s.body.degc[0]
+
+
 def expected(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
     """Return the static deflection (m) that the models expect at the end of a sample at `voltage` (V)."""
     total = thermal_deflection(c.thermal, s.body)
@@ -314,13 +331,8 @@ class Sensorless:
         return voltage
 
     def follow(self, voltage: float, temperature_degc: float = math.nan) -> None:
-        """Take note of a sample whose `voltage` (V) somebody else chose: a ramp to rest, a servo."""
-        c, s = self.coefficients, self.state
-        warmth = s.body.degc[0] - REFERENCE_DEGC
-        heat(c, s, temperature_degc)
-        operator_step(c.operator, s.hysteresis, voltage)
-        creep_step(c.creep, s.relaxations, voltage, warmth)
-        self._predict(voltage, warmth)
+        """Take note of a sample whose `voltage` (V) somebody else chose: a ramp to rest."""
+        self.predicted = follow_step(self.coefficients, self.state, voltage, temperature_degc)
 
     def pause(self, samples: int) -> None:
         """Let creep go on for `samples` that nobody asked for, with voltage and temperature held."""
@@ -334,8 +346,7 @@ class Sensorless:
 
     def settle(self, temperature_degc: float) -> None:
         """Learn the temperature that the finger has been in equilibrium with since its start."""
-        c, body = self.coefficients, self.state.body
-        body.degc[0] = body.degc_at_start[0] = min(max(temperature_degc, c.coldest), c.warmest)
+        settle(self.coefficients, self.state, temperature_degc)
 
     @property
     def body_degc(self) -> float:

@@ -131,6 +131,14 @@ def touch_rest() -> TouchState:
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
 
 
+def touch_start(s: TouchState, command: float, deflection: float, expected: float) -> None:
+    """Let a tip that nobody pushes begin at a `command` (m), its reference where it is (m)."""
+    s.missing[0] = s.missing[1] = s.zero[0] = expected - deflection
+    s.behind[0] = s.behind[1] = 0.0
+    s.way[0] = s.command[0] = command
+    s.reference[0] = deflection
+
+
 def low_pass(state: list[float], rate: float, value: float) -> None:
     """Let `state`, once and twice low-passed, follow `value`."""
     state[0] += rate * (value - state[0])

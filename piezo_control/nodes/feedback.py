@@ -25,6 +25,7 @@ from dataclasses import replace
 from typing import Any
 
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from piezo_control.feedback import Feedback, FeedbackParameters, successor
@@ -54,7 +55,7 @@ class FeedbackNode(BlockNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.pushes = self.create_publisher(Sample, "push", SAMPLE)
+        self._pushes: Publisher | None = None
         self.expected = Sample()
         self._expected_at = -math.inf
         self._expectations: Subscription | None = None
@@ -126,6 +127,8 @@ class FeedbackNode(BlockNode):
             self._expectations = self.create_subscription(
                 Sample, "expected", self._on_expected, LATCHED
             )
+            # A finger that has this topic is taken for one that feels.
+            self._pushes = self.create_publisher(Sample, "push", SAMPLE)
         elif p.controller != "none" and not p.certified:
             self.get_logger().warning(
                 f"controller '{p.name}' ({p.controller_file or 'from parameters'}) is not certified: nothing "
@@ -133,9 +136,10 @@ class FeedbackNode(BlockNode):
             )
 
     def stop(self) -> None:
-        if self._expectations:
+        if self._expectations and self._pushes:
             self.destroy_subscription(self._expectations)
-            self._expectations = None
+            self.destroy_publisher(self._pushes)
+            self._expectations = self._pushes = None
 
     def apply(self) -> None:
         if not self._take_file():
@@ -228,10 +232,13 @@ class FeedbackNode(BlockNode):
 
     def _tell_push(self, sample: Sample) -> None:
         """Tell the push of the object, not at every sample."""
-        if sample.number % max(1, round(PUSH_PERIOD / self.parameters.sample_time)) == 0:
+        if (
+            self._pushes
+            and sample.number % max(1, round(PUSH_PERIOD / self.parameters.sample_time)) == 0
+        ):
             push = Sample(header=sample.header, number=sample.number, period=PUSH_PERIOD)
             push.value = self.touch.push
-            self.pushes.publish(push)
+            self._pushes.publish(push)
 
     def _expectation(self) -> str:
         """Return in words whose deflection is expected, and by whom."""

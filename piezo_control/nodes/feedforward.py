@@ -22,19 +22,15 @@ import math
 import time
 from typing import Any
 
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import Temperature
-
 from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
-from piezo_control.nodes.block import BlockNode, seconds
+from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
-from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import LATCHED
+from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
     FAULT,
-    HIGHEST_DEGC,
     LARGEST_DEFLECTION,
-    LOWEST_DEGC,
     RAMP_PERIOD,
     RAMPING,
     limits,
@@ -60,7 +56,7 @@ class FeedforwardNode(BlockNode):
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
-        self._subscription: Subscription | None = None
+        self._temperature_input: TemperatureInput | None = None
         self._complained = ""
         self._build(self.parameters.rest)
 
@@ -81,9 +77,7 @@ class FeedforwardNode(BlockNode):
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures.clear()
         if self.parameters.compensator == "sensorless":
-            self._subscription = self.create_subscription(
-                Temperature, "temperature", self._on_temperature, SAMPLE
-            )
+            self._temperature_input = TemperatureInput(self, self._on_temperature)
         if self.parameters.mode == "free_running":
             self.watchdog.reset()
 
@@ -107,17 +101,11 @@ class FeedforwardNode(BlockNode):
 
     # --- temperature --------------------------------------------------------------------------------
 
-    def _on_temperature(self, message: Temperature) -> None:
-        degc = message.temperature
-        if not LOWEST_DEGC <= degc <= HIGHEST_DEGC:
-            self.get_logger().error(
-                f"'temperature' is {degc} °C, must be within [{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C; ignored",
-                throttle_duration_sec=1.0,
-            )
-        elif not self._is_on_grid():
+    def _on_temperature(self, degc: float, instant: float) -> None:
+        if not self._is_on_grid():
             self.thermometer.hear(degc, time.monotonic())
         else:
-            place = round(seconds(message.header.stamp) / self.parameters.temperature_period)
+            place = round(instant / self.parameters.temperature_period)
             if self._temperatures and place <= max(self._temperatures):
                 self._temperatures.clear()  # a new run, or once more from the present instant on
             self._temperatures[place] = degc
@@ -215,9 +203,9 @@ class FeedforwardNode(BlockNode):
         self.watchdog.reset()  # in lock-step too: the voltage goes to rest
 
     def stop(self) -> None:
-        if self._subscription:
-            self.destroy_subscription(self._subscription)
-            self._subscription = None
+        if self._temperature_input:
+            self._temperature_input.close()
+            self._temperature_input = None
         self.watchdog.cancel()
         self.guard.trip("stopped", time.monotonic())
         while self.guard.phase == RAMPING:

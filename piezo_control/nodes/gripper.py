@@ -187,7 +187,7 @@ class Finger:
             return f"finger '{self.name}' (nothing on '{topic}')"
         if self.state.phase != FingerState.RUNNING:
             return f"finger '{self.name}' (it is {PHASES[self.state.phase]})"
-        return f"finger '{self.name}' (it feels no more)"
+        return f"finger '{self.name}' (it tells no force)"
 
     def problem(self) -> str:
         """Return why the finger cannot move, or nothing."""
@@ -197,20 +197,24 @@ class Finger:
             text = f" ({self.state.text})" if self.state.text else ""
             phase = PHASES[self.state.phase].upper()
             return f"finger '{self.name}' is {phase}{text}, must be RUNNING"
+        if self.numbness():
+            return ""
+        topic = self._node.resolve_topic_name(f"{self.name}/push")
+        if math.isnan(self.push):
+            return f"finger '{self.name}' has told no force yet on '{topic}'"
         samples = self.state.samples - self._felt
-        if not self.numbness() and samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
-            topic = self._node.resolve_topic_name(f"{self.name}/push")
+        if samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
             return f"finger '{self.name}' feels no more: nothing on '{topic}' for {samples} samples"
         return ""
 
     def numbness(self) -> str:
         """Return why this finger cannot hold a force, or nothing."""
-        if math.isfinite(self.push):
-            return ""
         topic = self._node.resolve_topic_name(f"{self.name}/push")
+        if math.isfinite(self.push) or self._node.count_publishers(topic):
+            return ""
         return (
-            f"finger '{self.name}' feels no force (nothing on '{topic}'): its feedback needs `force_control: true`, "
-            "or leave max_force at 0 to go by position alone"
+            f"finger '{self.name}' feels no force (nobody publishes '{topic}'): its feedback or servo needs "
+            "`force_control: true`, or leave max_force at 0 to go by position alone"
         )
 
     def reset(self) -> None:

@@ -104,6 +104,13 @@ class ServoNodeParameters(ServoParameters):
         low=1e-3,
         high=1.0,
     )
+    force_control: bool = parameter(
+        False,
+        "a force limit acts in the loop, in place of the controller, of which sample time and range of the command "
+        "stay; the models of hysteresis, creep and heat are those of `feedforward_file`",
+    )
+    touch: TouchParameters = group(TouchParameters)
+    thermometer: ThermometerParameters = group(ThermometerParameters)
     priority: int = parameter(
         80, "of the loop under the real-time scheduler; 0: ordinary scheduler", low=0, high=99
     )
@@ -119,7 +126,7 @@ class ServoNodeParameters(ServoParameters):
         1e-2, "how often `samples` are published", unit="s", low=1e-3, high=1.0
     )
     sample_period: float = parameter(
-        1e-2, "how often a single deflection, command and voltage is published, for people", unit="s",
+        1e-2, "how often a single deflection, command, voltage and push is published", unit="s",
         low=1e-3, high=10.0,
     )  # fmt: skip
     state_period: float = parameter(
@@ -146,10 +153,10 @@ class RecorderParameters:
     topics: tuple[str, ...] = parameter(RECORDED, "topics to record, relative or absolute")
 
 
-def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
-    """Return inverse and limits of a parameter file, the limits as near to rest as the share to be used says."""
+def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardNodeParameters:
+    """Return inverse, models and limits of a parameter file, the limits as near to rest as the share to be used says."""
     path = parameters.feedforward_file
-    whole = build(FeedforwardParameters, load(path, "feedforward") if path else {}, path)
+    whole = build(FeedforwardNodeParameters, load(path, "feedforward") if path else {}, path)
     share, rest = parameters.voltage_share, whole.rest
     return replace(
         whole,
@@ -162,10 +169,11 @@ def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardParameters:
 def check_delay(controller: FeedbackParameters, p: ServoNodeParameters) -> None:
     """Raise ParameterError unless the controller was designed for the delay of the servo's loop.
 
-    An open loop was designed for any.
+    An open loop was designed for any, and a loop that feels has no controller.
     """
     delay = p.delay_samples + (p.write == "next_edge")
-    if controller.controller != "none" and controller.delay_samples != delay:
+    has_one = controller.controller != "none" and not p.force_control
+    if has_one and controller.delay_samples != delay:
         raise ParameterError(
             f"controller '{p.controller_file}' was designed for a delay of {controller.delay_samples} samples, "
             f"this loop has {delay}: 'delay_samples' {p.delay_samples}, 'write' {p.write}"

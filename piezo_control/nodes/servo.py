@@ -2,14 +2,16 @@
 """The loop in real time: K and H_s⁻¹ between a deflection sensor and a voltage amplifier.
 
 in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0),
-     reference_waveform (Waveform, m)
+     reference_waveform (Waveform, m), temperature (sensor_msgs/Temperature, °C) with `force_control`
 out: samples (SampleBlock: every sample), deflection (Sample, m), command (Sample, m), voltage (Sample, V): one
-     in a hundred or so, state (FingerState)
+     in a hundred or so, state (FingerState), push (Sample, N) with `force_control`: the force of an object
 
 One compiled loop in a thread under the real-time scheduler, at the sample time of its controller; ROS
 runs beside it and can be late without the finger noticing. What the certificate of the controller does not
 cover ends with the voltage at rest and a fault that stays until `~/reset`: a silent, old, frozen or saturated
 sensor, a deflection that the model cannot explain, an oscillation, late or missed periods, a lost device.
+With `force_control` the loop pushes with no more than the profile's `max_force` and its own `touch.force_limit`
+(:mod:`piezo_control.touch`).
 """
 
 from __future__ import annotations
@@ -27,11 +29,20 @@ from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, rea
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.parameters import ParameterError
-from piezo_control.safety import FAULT, HOLDING, LARGEST_DEFLECTION, NORMAL, RAMPING
+from piezo_control.safety import (
+    FAULT,
+    HOLDING,
+    LARGEST_DEFLECTION,
+    NORMAL,
+    RAMPING,
+)
 from piezo_control.servo.clock import lateness_quantile
 from piezo_control.servo.driver import DriverError, open_driver
+from piezo_control.servo.law import feeling_of
 from piezo_control.servo.loop import Samples, Servo
+from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 
 TARGET_TIME = 0.1  # s that the error stays small before a finger is on target
@@ -57,6 +68,8 @@ class ServoNode(FingerNode):
             for name in ("deflection", "command", "voltage")
         }
         self.states = self.create_publisher(FingerState, "state", LATCHED)
+        self.thermometer = Thermometer(self.parameters.thermometer, time.monotonic())
+        self._temperature_input: TemperatureInput | None = None
         self.reference = ProfileInput(self, "reference", 1.0, LARGEST_DEFLECTION, self._refer)
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
@@ -74,6 +87,10 @@ class ServoNode(FingerNode):
         if parameters.controller_file != self.parameters.controller_file or not self.active:
             controller = self._controller(parameters.controller_file)
             check_delay(controller, parameters)
+            if self.servo and parameters.force_control:
+                raise ParameterError(
+                    "'controller_file': with 'force_control' no controller runs, which could change"
+                )
             if self.servo and controller.sample_time != self.servo.sample_time:
                 raise ParameterError(
                     f"'controller_file' is '{parameters.controller_file}', made for "
@@ -88,7 +105,7 @@ class ServoNode(FingerNode):
         p = self.parameters
         controller = self._controller(p.controller_file)
         check_delay(controller, p)
-        if controller.controller != "none" and not controller.certified:
+        if controller.controller != "none" and not (controller.certified or p.force_control):
             self.get_logger().warning(
                 f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "
                 "that the loop is stable with this finger"
@@ -98,9 +115,16 @@ class ServoNode(FingerNode):
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
-        self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin)
+        feeling = None
+        if p.force_control:
+            feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
+            self.thermometer = Thermometer(p.thermometer, time.monotonic())
+            self._temperature_input = TemperatureInput(self, self._on_temperature)
+            # A finger that has this topic is taken for one that feels.
+            self.singles["push"] = self.create_publisher(Sample, "push", SAMPLE)
+        self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling)
         self.reference.restart(controller.sample_time)
-        self.servo.refer(self.reference.signal)
+        self._refer()
         self._told = time.monotonic()
         self._since = math.nan
         self._rates = [(self._told, 0)]
@@ -121,6 +145,10 @@ class ServoNode(FingerNode):
 
     def stop(self) -> None:
         self.drain.cancel()
+        if self._temperature_input:
+            self._temperature_input.close()
+            self._temperature_input = None
+            self.destroy_publisher(self.singles.pop("push"))
         if self.servo:
             self.servo.stop()
             self._publish_samples()
@@ -157,11 +185,37 @@ class ServoNode(FingerNode):
         }
         for share in (0.5, 0.9, 0.99, 0.999):
             figures[f"late, {share:.1%} (us)"] = f"{lateness_quantile(lateness, share) * 1e6:.0f}"
-        return s.cause or s.complaint, figures
+        if self.parameters.force_control:
+            figures |= {"push": s.push, "temperature": self.thermometer.degc}
+        return s.cause or self._doubts(s), figures
+
+    def _doubts(self, servo: Servo) -> str:
+        """Return what is not as it should be, and ends nothing."""
+        return servo.complaint or (self.thermometer.wrong if self._temperature_input else "")
 
     def _refer(self) -> None:
         if self.servo:
-            self.servo.refer(self.reference.signal)
+            self.servo.refer(self.reference.signal, self.reference.max_force)
+
+    def _on_temperature(self, degc: float, _: float) -> None:
+        self.thermometer.hear(degc, time.monotonic())
+
+    def _pass_temperature_on(self, servo: Servo) -> None:
+        """Tell the loop the temperature, or that there is none to believe, and say that once."""
+        complaint = self.thermometer.wrong
+        servo.feel(self.thermometer.read(time.monotonic()))
+        wrong = self.thermometer.wrong
+        if wrong and self.parameters.thermometer.fallback == "fault":
+            servo.give_up_without_temperature()
+        if wrong == complaint:
+            return
+        if wrong:
+            self.get_logger().error(
+                f"{wrong}; the models go on with the temperature that they have"
+            )
+        else:
+            self.get_logger().info(f"temperature is back: {self.thermometer.degc:g} °C")
+        self.publish_diagnostics()
 
     def _rate(self) -> float:
         """Return how many samples a second were served lately."""
@@ -172,6 +226,8 @@ class ServoNode(FingerNode):
         """Keep the loop supplied with references, and say what it does."""
         if self.servo:
             self.servo.look_ahead()
+            if self._temperature_input:
+                self._pass_temperature_on(self.servo)
             if self.servo.complaint and not self._complained:
                 self.get_logger().warning(self.servo.complaint)
                 self._complained = True
@@ -250,7 +306,7 @@ class ServoNode(FingerNode):
             state.overruns = s.missed
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
-            state.text = s.cause or s.complaint
+            state.text = s.cause or self._doubts(s)
             state.since = base.wall_time(self._since)
             state.times = s.faults
             if self._last:

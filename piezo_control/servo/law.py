@@ -4,7 +4,8 @@
     reading -> deflection -> K -> H_s⁻¹ with its limits -> voltage
 
 The laws are those of the nodes (:mod:`piezo_control.feedback`, :mod:`piezo_control.feedforward`,
-:mod:`piezo_control.safety`). What the certificate does not cover ends at rest and stays there until a reset:
+:mod:`piezo_control.safety`). A servo that feels has the law of :mod:`piezo_control.touch` in place of K; what it
+expects of a tip that nobody pushes the models of :mod:`piezo_control.sensorless` say, which follow its voltage. What the certificate does not cover ends at rest and stays there until a reset:
 a sensor that is silent, old, frozen or out of its range, a deflection that the model cannot explain, a loop that
 oscillates, periods that are late or missed, a device that is gone.
 """
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,8 +49,29 @@ from piezo_control.safety import (
     limits,
     toward,
 )
+from piezo_control.sensorless import (
+    SensorlessCoefficients,
+    SensorlessParameters,
+    SensorlessState,
+    follow_step,
+    sensorless_coefficients,
+    sensorless_rest,
+    settle,
+)
 from piezo_control.servo.driver import FAILED, FRESH
 from piezo_control.servo.parameters import ServoParameters
+from piezo_control.shaping import ShapingParameters
+from piezo_control.thermal import REFERENCE_DEGC
+from piezo_control.touch import (
+    TouchCoefficients,
+    TouchParameters,
+    TouchState,
+    feel,
+    press,
+    touch_coefficients,
+    touch_rest,
+    touch_start,
+)
 
 LARGEST_ORDER = 32
 
@@ -56,8 +79,8 @@ LARGEST_ORDER = 32
 # Causes of a fault, and what each says of the value that was seen.
 (
     NO_CAUSE, SENSOR_SILENT, SENSOR_OLD, SENSOR_FROZEN, SENSOR_RANGE, MODEL, CYCLE, MISSED, LATE, DEVICE,
-    STOPPED,
-) = range(11)  # fmt: skip
+    STOPPED, TEMPERATURE,
+) = range(12)  # fmt: skip
 
 CAUSES: dict[int, Callable[[float, ServoParameters], str]] = {
     SENSOR_SILENT: lambda v, p: f"no reading of the sensor for {p.hold_time:g} s",
@@ -83,6 +106,7 @@ CAUSES: dict[int, Callable[[float, ServoParameters], str]] = {
     ),
     DEVICE: lambda v, p: "the device failed; its voltage may not be at rest",
     STOPPED: lambda v, p: "stopped",
+    TEMPERATURE: lambda v, p: "the temperature is missing or frozen",
 }
 
 
@@ -104,6 +128,7 @@ class Settings(NamedTuple):
     missed_limit: float
     late_share: float
     voltage: Limits
+    feels: bool
 
 
 class Controller(NamedTuple):
@@ -122,13 +147,27 @@ class Controller(NamedTuple):
     hand_over: np.ndarray  # (order, 3), row by row
 
 
+class Feeling(NamedTuple):
+    """What tells the push of an object and holds it; arrays of one number change in place."""
+
+    models: SensorlessCoefficients
+    models_state: SensorlessState
+    touch: TouchCoefficients
+    touch_state: TouchState
+    expected: np.ndarray  # m, the next reading if nobody pushes
+    temperature: np.ndarray  # °C, NaN: none is known
+    is_settled: np.ndarray  # 0 before the first temperature
+    max_force: np.ndarray  # N
+
+
 class Laws(NamedTuple):
-    """The laws of a finger: two controllers, one in use and one to change to, and H_s⁻¹."""
+    """The laws of a finger: two controllers, one in use and one to change to, H_s⁻¹, and what feels."""
 
     controllers: tuple[Controller, Controller]
     states: FeedbackState  # of the controller in use
     feedforward: FeedforwardCoefficients
     feedforward_state: FeedforwardState
+    feeling: Feeling
 
 
 class Watch(NamedTuple):
@@ -159,9 +198,12 @@ class Watch(NamedTuple):
 
 
 def settings_of(
-    parameters: ServoParameters, feedforward: FeedforwardParameters, sample_time: float
+    parameters: ServoParameters,
+    feedforward: FeedforwardParameters,
+    sample_time: float,
+    feels: bool = False,
 ) -> Settings:
-    """Return the settings of the loop at this sample time (s)."""
+    """Return the settings of the loop at this sample time (s); where it `feels`, touch is in place of K."""
     p = parameters
     return Settings(
         sample_time,
@@ -179,6 +221,7 @@ def settings_of(
         float(p.missed_limit),
         p.late_share,
         limits(feedforward, p.ramp),
+        feels,
     )
 
 
@@ -209,15 +252,43 @@ def put_controller(room: Controller, parameters: FeedbackParameters) -> None:
     room.hand_over[: matrix.size] = matrix.ravel()
 
 
-def laws_of(feedback: FeedbackParameters, feedforward: Feedforward) -> Laws:
-    """Return the laws of a finger at rest."""
+def feeling_of(
+    touch: TouchParameters, models: SensorlessParameters, feedback: FeedbackParameters, degc: float
+) -> Feeling:
+    """Return what feels for a finger at rest at `degc` (°C), with sample time and command range of `feedback`.
+
+    Raises ParameterError for models that have no inverse.
+    """
+    h = feedback.sample_time
+    # The models follow a voltage here, and never shape a reference.
+    coefficients = sensorless_coefficients(replace(models, shaping=ShapingParameters("none")), h)
+    return Feeling(
+        as_arrays(coefficients),
+        as_arrays(sensorless_rest(coefficients, degc)),
+        touch_coefficients(touch, h, feedback.command_low, feedback.command_high),
+        as_arrays(touch_rest()),
+        expected=np.zeros(1),
+        temperature=np.full(1, math.nan),
+        is_settled=np.zeros(1),
+        max_force=np.full(1, touch.force_limit),
+    )
+
+
+def laws_of(
+    feedback: FeedbackParameters, feedforward: Feedforward, feeling: Feeling | None = None
+) -> Laws:
+    """Return the laws of a finger at rest; without `feeling` the paper's, which nobody asks."""
     controllers = (empty_controller(), empty_controller())
     put_controller(controllers[0], feedback)
+    if feeling is None:
+        models = SensorlessParameters()
+        feeling = feeling_of(TouchParameters(), models, feedback, REFERENCE_DEGC)
     return Laws(
         controllers,
         as_arrays(FeedbackState([0.0] * LARGEST_ORDER, [0.0] * LARGEST_ORDER)),
         as_arrays(feedforward.coefficients),
         as_arrays(feedforward.state),
+        feeling,
     )
 
 
@@ -267,12 +338,30 @@ def servo_step(
     reference: float,
     share: float,
 ) -> float:
-    """Return the voltage (V) of one sample.
+    """Return the voltage (V) of one sample, which the models of a finger that feels follow.
 
     `wanted` is the controller to use (0 or 1), `status` and `raw` what the card returned and read, `age` the
     age of that (s), `reference` in m. `share` (0 to 1) is the part of a sample time from the last voltage to
     this one at the actuator, so that the slew limit holds in time.
     """
+    voltage = answer(c, laws, w, wanted, status, raw, age, reference, share)
+    if c.feels:
+        expect(laws.feeling, voltage)
+    return voltage
+
+
+def answer(
+    c: Settings,
+    laws: Laws,
+    w: Watch,
+    wanted: int,
+    status: int,
+    raw: float,
+    age: float,
+    reference: float,
+    share: float,
+) -> float:
+    """Return the voltage (V) of one sample; arguments as of :func:`servo_step`."""
     last = laws.feedforward_state.hysteresis.voltage[0]
     if status == FAILED:
         trip(w, DEVICE, 0.0)
@@ -292,6 +381,36 @@ def servo_step(
         return last
     w.phase[0] = NORMAL
     deflection = c.sensor_scale * (raw - c.sensor_zero)
+    if c.feels:
+        w.command[0] = touch(laws, w, wanted, reference, deflection)
+    else:
+        w.command[0] = control(laws, w, wanted, reference, deflection)
+    judge_loop(c, w, reference, reference - deflection)
+    return feedforward_step(laws.feedforward, laws.feedforward_state, w.command[0], share)
+
+
+def touch(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float) -> float:
+    """Return the command (m) that follows the reference and pushes with no more than is allowed."""
+    f = laws.feeling
+    if w.in_use[0] < 0.0:
+        command = modelled_deflection(laws.feedforward, laws.feedforward_state)
+        touch_start(f.touch_state, command, deflection, f.expected[0])
+        w.in_use[0] = wanted
+    feel(f.touch, f.touch_state, f.expected[0], deflection)
+    return press(f.touch, f.touch_state, reference, deflection, f.max_force[0])
+
+
+def expect(f: Feeling, voltage: float) -> None:
+    """Let the models follow the voltage (V), and keep what they expect of the next reading."""
+    degc = f.temperature[0]
+    if f.is_settled[0] == 0.0 and degc == degc:  # not NaN
+        settle(f.models, f.models_state, degc)
+        f.is_settled[0] = 1.0
+    f.expected[0] = follow_step(f.models, f.models_state, voltage, degc)
+
+
+def control(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float) -> float:
+    """Return the command (m) of the controller, which takes over here if it was another before."""
     k = laws.controllers[wanted]
     order = k.order[0]
     x = laws.states.x[:order]
@@ -320,9 +439,7 @@ def servo_step(
         k.command_high[0],
     )
     state = FeedbackState(x, laws.states.x_next[:order])
-    w.command[0] = feedback_step(coefficients, state, reference, deflection)
-    judge_loop(c, w, reference, reference - deflection)
-    return feedforward_step(laws.feedforward, laws.feedforward_state, w.command[0], share)
+    return feedback_step(coefficients, state, reference, deflection)
 
 
 def judge_reading(c: Settings, w: Watch, raw: float, age: float, voltage: float) -> None:

@@ -33,6 +33,8 @@ from piezo_control.servo.law import (
     NO_CAUSE,
     SENSOR_SILENT,
     STOPPED,
+    TEMPERATURE,
+    Feeling,
     Laws,
     Settings,
     Watch,
@@ -46,6 +48,7 @@ from piezo_control.servo.law import (
     watch_at_rest,
 )
 from piezo_control.servo.parameters import ServoParameters
+from piezo_control.touch import push_of
 
 AHEAD = 1.0  # s: how far references are laid out in advance
 MARGIN = 5  # samples that a new reference leaves to the loop, which is about to read them
@@ -58,6 +61,7 @@ class Orders(NamedTuple):
     stop: np.ndarray
     reset: np.ndarray  # counts the resets asked for
     controller: np.ndarray  # which one to use
+    fault: np.ndarray  # cause of a fault that is not the loop's to see; NO_CAUSE: none
 
 
 class References(NamedTuple):
@@ -78,6 +82,7 @@ class Log(NamedTuple):
     deflection: np.ndarray
     command: np.ndarray
     voltage: np.ndarray
+    push: np.ndarray
 
 
 class Loop(NamedTuple):
@@ -113,6 +118,8 @@ def run(loop: Loop, device: Any) -> None:
             rearm(loop.watch)
         if loop.orders.stop[0] != 0 and loop.watch.phase[0] < RAMPING:
             trip(loop.watch, STOPPED, 0.0)
+        if loop.orders.fault[0] != NO_CAUSE and loop.watch.phase[0] < RAMPING:
+            trip(loop.watch, loop.orders.fault[0], 0.0)
         judge_time(loop.settings, loop.watch, late * 1e-9, float(clock.missed[0] - missed))
         written = FRESH
         if loop.at_next_edge:
@@ -162,6 +169,8 @@ def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int
         log.deflection[row] = c.sensor_scale * (reading[0] - c.sensor_zero)
     log.command[row] = loop.watch.command[0]
     log.voltage[row] = voltage
+    feeling = loop.laws.feeling
+    log.push[row] = push_of(feeling.touch, feeling.touch_state)
     log.count[0] += 1
     return voltage
 
@@ -174,9 +183,9 @@ def loop_with(driver: Driver) -> Callable[[Loop, Any], None]:
 
 @dataclass(frozen=True)
 class Samples:
-    """Consecutive samples of the loop; `instant` and `late` in s (monotonic clock), m and V.
+    """Consecutive samples of the loop; `instant` and `late` in s (monotonic clock), m, V and N.
 
-    A deflection that did not come in time is NaN; a number that is left out was missed.
+    A deflection that did not come in time is NaN; a number that is left out was missed. `push` is of a servo that feels.
     """
 
     number: np.ndarray
@@ -186,6 +195,7 @@ class Samples:
     deflection: np.ndarray
     command: np.ndarray
     voltage: np.ndarray
+    push: np.ndarray
 
     def __len__(self) -> int:
         return len(self.number)
@@ -203,6 +213,8 @@ class Servo:
     priority, cpu, spin
         Of the loop's thread: of SCHED_FIFO (0: ordinary), the CPU to stay on (-1: any), and how long
         before an edge it stops sleeping (s).
+    feeling : Feeling, optional
+        With it the loop follows its reference no further than the force limit lets it, in place of the controller.
 
     Raises ParameterError for a controller that does not fit.
     """
@@ -216,6 +228,7 @@ class Servo:
         priority: int = 0,
         cpu: int = -1,
         spin: float = 5e-5,
+        feeling: Feeling | None = None,
     ) -> None:
         self.driver = driver
         self.parameters = parameters
@@ -225,8 +238,8 @@ class Servo:
         self.complaint = ""
         ahead, kept = (1 << math.ceil(math.log2(max(span / h, 64))) for span in (2 * AHEAD, KEPT))
         self._loop = Loop(
-            settings=settings_of(parameters, feedforward, h),
-            laws=laws_of(feedback, Feedforward(feedforward, h)),
+            settings=settings_of(parameters, feedforward, h, feels=feeling is not None),
+            laws=laws_of(feedback, Feedforward(feedforward, h), feeling),
             watch=watch_at_rest(),
             clock=clock_of(h, min(spin, 0.8 * h)),
             orders=Orders(*(np.zeros(1, dtype=np.int64) for _ in Orders._fields)),
@@ -234,11 +247,12 @@ class Servo:
             log=Log(
                 np.zeros(1, dtype=np.int64),
                 *(np.full(kept, 0, dtype=np.int64) for _ in range(3)),
-                *(np.full(kept, 0.0) for _ in range(4)),
+                *(np.full(kept, 0.0) for _ in range(5)),
             ),
             amplifier_gain=parameters.amplifier_gain,
             at_next_edge=parameters.write == "next_edge",
         )
+        self._force_limit = float(self._loop.laws.feeling.max_force[0])
         self._run = loop_with(driver)
         self._taken = 0
         self.lost = 0
@@ -273,8 +287,17 @@ class Servo:
             self._thread.join()
         self.driver.close()
 
+    def feel(self, temperature_degc: float) -> None:
+        """Tell the models the temperature; NaN is one that is missing: the body keeps the one it has."""
+        self._loop.laws.feeling.temperature[0] = temperature_degc
+
+    def give_up_without_temperature(self) -> None:
+        """End at rest, because the temperature cannot be believed."""
+        self._loop.orders.fault[0] = TEMPERATURE
+
     def reset(self) -> None:
         """Leave a latched fault; the controller takes over from rest."""
+        self._loop.orders.fault[0] = NO_CAUSE
         self._loop.orders.reset[0] += 1
 
     def change_controller(self, feedback: FeedbackParameters) -> None:
@@ -300,9 +323,13 @@ class Servo:
         """Number of the last sample, -1 before the first."""
         return int(self._loop.clock.number[0])
 
-    def refer(self, signal: Signal) -> None:
-        """Follow a reference (m over s since sample 0) from a few samples ahead of the present one on."""
+    def refer(self, signal: Signal, max_force: float = math.inf) -> None:
+        """Follow a reference (m over s since sample 0) from a few samples ahead of the present one on.
+
+        A servo that feels pushes with `max_force` (N) at most, and with no more than its own limit.
+        """
         self._signal = signal
+        self._loop.laws.feeling.max_force[0] = min(max_force, self._force_limit)
         self._lay_out(self.number + MARGIN if self.is_running else 0)
 
     def look_ahead(self) -> None:
@@ -355,6 +382,12 @@ class Servo:
     def clipped(self) -> int:
         """Number of samples at which the voltage or slew limit acted."""
         return int(self._loop.laws.feedforward_state.clipped[0])
+
+    @property
+    def push(self) -> float:
+        """Force (N) that pushes the tip back, as estimated by a servo that feels."""
+        feeling = self._loop.laws.feeling
+        return float(push_of(feeling.touch, feeling.touch_state))
 
     @property
     def faults(self) -> int:

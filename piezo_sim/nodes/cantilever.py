@@ -22,22 +22,20 @@ from typing import Any
 
 import numpy as np
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import Temperature
 
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import seconds, wrong_time
+from piezo_control.nodes.block import wrong_time
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
 from piezo_control.nodes.sole_input import SoleInput
+from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
     FAULT,
-    HIGHEST_DEGC,
     HOLDING,
     LARGEST_FORCE,
     LARGEST_VOLTAGE,
-    LOWEST_DEGC,
     NORMAL,
     RAMPING,
     Guard,
@@ -67,7 +65,7 @@ class CantileverNode(FingerNode):
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
         self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_around)
-        self.create_subscription(Temperature, "temperature", self._on_temperature, SAMPLE)
+        TemperatureInput(self, self._on_temperature)
         self.create_subscription(Fault, "fault", self._on_fault, FAULTS)
         self.faults: dict[str, str] = {}
         self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
@@ -229,20 +227,11 @@ class CantileverNode(FingerNode):
         self.without_temperature = voltage.without_temperature
         self.pending_voltage = voltage.value
 
-    def _on_temperature(self, message: Temperature) -> None:
-        if not LOWEST_DEGC <= message.temperature <= HIGHEST_DEGC:
-            self.get_logger().error(
-                f"'temperature' is {message.temperature} °C, must be within "
-                f"[{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C; ignored",
-                throttle_duration_sec=1.0,
-            )
-        elif self.parameters.mode == "free_running" or not self.parameters.temperature_lockstep:
-            self.temperature = message.temperature
+    def _on_temperature(self, degc: float, instant: float) -> None:
+        if self.parameters.mode == "free_running" or not self.parameters.temperature_lockstep:
+            self.temperature = degc
         elif self.active:
-            instant = seconds(message.header.stamp)
-            self.temperatures[round(instant / self.parameters.temperature_period)] = (
-                message.temperature
-            )
+            self.temperatures[round(instant / self.parameters.temperature_period)] = degc
             self._advance()
 
     def _advance(self) -> None:

@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The servo that feels: its law against the engine's, a finger in real time, and a gripper of two servos."""
+
+import io
+import signal
+import subprocess
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from test_servo import EXECUTABLES, PATIENT, TIMEOUT, wait
+
+from piezo_control.feedback import FeedbackParameters, read_controller
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.gripper import AT_LIMIT, GripperParameters
+from piezo_control.nodes import fingerctl
+from piezo_control.nodes.client import connect
+from piezo_control.profile import Profile
+from piezo_control.safety import FAULT, NORMAL
+from piezo_control.sensorless import SensorlessParameters
+from piezo_control.servo import law
+from piezo_control.servo.driver import FRESH
+from piezo_control.servo.law import feeling_of, laws_of, servo_step, settings_of, watch_at_rest
+from piezo_control.servo.loop import Servo
+from piezo_control.servo.parameters import ServoParameters
+from piezo_control.thermal import REFERENCE_DEGC
+from piezo_control.touch import TouchParameters, push_of
+from piezo_gripper_msgs.msg import FingerState
+from piezo_sim.driver import Simulation
+from piezo_sim.engine import run_touching
+from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
+from piezo_sim.plant.contact import ContactParameters
+from piezo_sim.plant.sensor import SensorParameters
+from piezo_sim.temperature import TemperatureParameters
+
+H = 1e-4  # s
+OPEN_LOOP = FeedbackParameters(controller="none")  # gives sample time and range of the command
+LIMIT = 0.5e-3  # N
+WALL = ContactParameters(stiffness=3000.0, damping=0.05, free_play=5e-6)
+DEFAULTS = TouchParameters()
+
+
+def feeling(degc=REFERENCE_DEGC):
+    return feeling_of(DEFAULTS, SensorlessParameters(), OPEN_LOOP, degc)
+
+
+class Bench:
+    """The law of a servo that feels, without its clock, on a cantilever."""
+
+    def __init__(self, plant):
+        feedforward = FeedforwardParameters()
+        self.settings = settings_of(ServoParameters(), feedforward, H, feels=True)
+        self.laws = laws_of(OPEN_LOOP, Feedforward(feedforward, H), feeling())
+        self.watch = watch_at_rest()
+        self.plant = Cantilever(plant)
+        self.voltages, self.pushes = [], []
+
+    def step(self, reference, max_force, degc=REFERENCE_DEGC):
+        feels = self.laws.feeling
+        feels.max_force[0] = max_force
+        feels.temperature[0] = degc
+        voltage = servo_step(
+            self.settings,
+            self.laws,
+            self.watch,
+            0,
+            FRESH,
+            self.plant.measure(),
+            0.0,
+            reference,
+            1.0,
+        )
+        self.plant.advance(voltage, degc)
+        self.voltages.append(voltage)
+        self.pushes.append(push_of(feels.touch, feels.touch_state))
+
+
+def test_the_law_gives_the_samples_of_the_engine():
+    """From the first contact to the held force; the engine's feedforward is solved in another order."""
+    plant = CantileverParameters(contact=WALL, sensor=SensorParameters(noise=0.0, resolution=0.0))
+    reference = Profile([0.0, 0.05], [0.0, 10e-6], linear=True)
+    samples = 1500
+    expected, push = run_touching(
+        plant, DEFAULTS, SensorlessParameters(), TemperatureParameters(), reference,
+        Profile([0.0], [LIMIT]), samples,
+    )  # fmt: skip
+    bench = Bench(plant)
+    for number in range(samples):
+        bench.step(float(reference.at(number * H)), LIMIT)
+    np.testing.assert_allclose(bench.voltages, expected.voltage, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(bench.pushes, push, rtol=0, atol=1e-9)
+    assert bench.watch.phase[0] == NORMAL
+    assert -bench.plant.tip_force == pytest.approx(LIMIT, rel=0.03)
+
+
+def test_after_a_fault_the_force_is_met_anew():
+    bench = Bench(CantileverParameters(contact=WALL))
+    for _ in range(1000):
+        bench.step(10e-6, LIMIT)
+    assert -bench.plant.tip_force == pytest.approx(LIMIT, rel=0.1)
+    law.trip(bench.watch, law.STOPPED, 0.0)
+    for _ in range(1000):
+        bench.step(10e-6, LIMIT)
+    assert bench.watch.phase[0] == FAULT and bench.voltages[-1] == 0.0
+    law.rearm(bench.watch)
+    strongest = 0.0
+    for _ in range(2000):
+        bench.step(10e-6, LIMIT)
+        strongest = max(strongest, -bench.plant.tip_force)
+    # The estimate on this plant is good to 0.05 mN (docs/touch.md).
+    assert LIMIT - 0.05e-3 < strongest < LIMIT + 0.05e-3
+
+
+def test_a_finger_in_real_time_stops_at_a_wall(tmp_path):
+    """However late the loop is served: the sensor's quantum of 10 nm is 0.03 mN of a free tip."""
+    file = tmp_path / "wall.yaml"
+    contact = {"stiffness": 3000.0, "damping": 0.05, "free_play": 5e-6}
+    file.write_text(yaml.safe_dump({"cantilever": {"ros__parameters": {"contact": contact}}}))
+    servo = Servo(
+        Simulation(str(file), H), PATIENT, read_controller("robust"), FeedforwardParameters(),
+        feeling=feeling(),
+    )  # fmt: skip
+    pushes = []
+
+    def presses():
+        servo.look_ahead()
+        pushes.extend(servo.samples().push)
+        return len(pushes) > 5000 and min(pushes[-2000:]) > 0.9 * LIMIT
+
+    servo.start()
+    try:
+        wait(lambda: servo.number > 100)
+        servo.feel(REFERENCE_DEGC)
+        servo.refer(Profile([0.0], [15e-6]), LIMIT)
+        wait(presses, "the force")
+        device = servo.driver.device
+        assert -device.state.tip_force[0] == pytest.approx(LIMIT, abs=0.08e-3)
+        assert max(pushes) < 1.3 * LIMIT
+        servo.give_up_without_temperature()
+        wait(lambda: servo.phase == FAULT)
+        assert servo.cause == "the temperature is missing or frozen"
+        servo.reset()
+        wait(lambda: servo.phase == NORMAL)
+    finally:
+        servo.stop()
+
+
+@contextmanager
+def gripper_of_servos(folder):
+    """Start two servos that feel, each with a wall in front of its simulated finger, and the gripper."""
+    contact = {"stiffness": 3000.0, "damping": 0.05, "free_play": 5e-6}
+    plant = folder / "wall.yaml"
+    plant.write_text(yaml.safe_dump({"cantilever": {"ros__parameters": {"contact": contact}}}))
+    servo = {
+        "driver_options": str(plant), "force_control": True, "missed_limit": 10**6, "late_share": 1.0,
+        "state_period": 0.01, "hold_time": 60.0, "age_limit": 10.0,
+    }  # fmt: skip
+    nodes = {"servo": servo, "gripper": {"state_timeout": 20.0}}
+    file = folder / "parameters.yaml"
+    file.write_text(yaml.safe_dump({f"/**/{n}": {"ros__parameters": p} for n, p in nodes.items()}))
+    words = ["--ros-args", "--params-file", file]
+    commands = {side: ["servo", *words, "-r", f"__ns:=/{side}"] for side in ("left", "right")}
+    commands["gripper"] = ["gripper", *words]
+    processes = []
+    with ExitStack() as stack:
+        for name, (executable, *arguments) in commands.items():
+            log = stack.enter_context((folder / f"{name}.log").open("wb"))
+            processes.append(
+                subprocess.Popen([EXECUTABLES / executable, *arguments], stdout=log, stderr=log)
+            )
+        try:
+            yield stack.enter_context(connect(TIMEOUT))
+        finally:
+            for process in processes:
+                process.send_signal(signal.SIGTERM)
+            codes = [process.wait(TIMEOUT) for process in processes]
+    assert codes == [0, 0, 0]
+
+
+def test_a_gripper_of_two_servos_grasps_and_lets_go(tmp_path):
+    with gripper_of_servos(tmp_path) as ros:
+        gripper = ros.gripper()
+        grasped = gripper.grasp(LIMIT, 200e-6)
+        assert AT_LIMIT * LIMIT <= grasped.force < 1.3 * LIMIT
+        opening = GripperParameters().rest_opening - 2 * (WALL.free_play + LIMIT / WALL.stiffness)
+        assert grasped.opening == pytest.approx(opening, abs=0.15e-6)
+        finger = ros.finger("left")
+        finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+        # Nobody publishes a temperature here, and that is said where people look.
+        finger.wait_for(lambda: finger.state.text == "temperature missing: none for 5 s")
+        text = io.StringIO()
+        arguments = fingerctl.parse(["-f", "left", "state"])
+        assert fingerctl.carry_out(ros, arguments, Console(file=text, width=120)) == 0
+        assert gripper.release(200e-6).reached_goal
+    left = (tmp_path / "left.log").read_text()
+    assert "temperature missing: none for 5 s; the models go on with" in left
+    assert "Traceback" not in left
