@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A gripper: two fingers in the namespaces left and right, and the gripper node in front of them.
 
-`rviz:=true` shows it, where robot_state_publisher and rviz2 are installed.
+What is not declared here goes to both fingers, as `params:=FILE` or `plant:=none` (finger.launch.py). `rviz:=true`
+shows the gripper, where robot_state_publisher and rviz2 are installed.
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.conditions import IfCondition
 from launch.substitutions import Command, LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch_ros.actions import Node, PushROSNamespace
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
@@ -16,7 +17,10 @@ FINGERS = ("left", "right")  # the default of the gripper node; lists do not pas
 # States as often as the gripper publishes joint states, and a force limit that the fingers keep by themselves.
 OF_A_GRIPPER = {"state_period": "0.01", "force_control": "true"}
 ARGUMENTS = {
+    "gripper_namespace": ("", "namespace of the gripper; those of the fingers are below it"),
     "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
+    "autostart": ("true", "false: whoever supervises the nodes configures and activates them"),
+    "log_level": ("info", "of every node"),
     "joint_states": (
         "joint_states",
         "topic of joint states; behind ros2_control: gripper/joint_states",
@@ -35,40 +39,45 @@ def generate_launch_description() -> LaunchDescription:
     layout = PathJoinSubstitution([share, "description", "config", "gripper.rviz"])
     joint_states = ("joint_states", LaunchConfiguration("joint_states"))
     shown = IfCondition(LaunchConfiguration("rviz"))
+    nodes = [
+        *(
+            IncludeLaunchDescription(
+                finger, launch_arguments={"namespace": side, **OF_A_GRIPPER}.items()
+            )
+            for side in FINGERS
+        ),
+        Node(
+            package="piezo_gripper",
+            executable="gripper",
+            parameters=[
+                {name: LaunchConfiguration(name) for name in ("sample_time", "autostart")},
+            ],
+            ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+            remappings=[joint_states],
+            output="screen",
+        ),
+        Node(
+            package="robot_state_publisher",
+            executable="robot_state_publisher",
+            parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
+            remappings=[joint_states],
+            condition=shown,
+            output="screen",
+        ),
+        Node(
+            package="rviz2",
+            executable="rviz2",
+            arguments=["-d", layout],
+            condition=shown,
+            output="screen",
+        ),
+    ]
     return LaunchDescription(
         [
             *(
                 DeclareLaunchArgument(name, default_value=value, description=text)
                 for name, (value, text) in ARGUMENTS.items()
             ),
-            *(
-                IncludeLaunchDescription(
-                    finger,
-                    launch_arguments={"namespace": side, **OF_A_GRIPPER}.items(),
-                )
-                for side in FINGERS
-            ),
-            Node(
-                package="piezo_gripper",
-                executable="gripper",
-                parameters=[{"sample_time": LaunchConfiguration("sample_time")}],
-                remappings=[joint_states],
-                output="screen",
-            ),
-            Node(
-                package="robot_state_publisher",
-                executable="robot_state_publisher",
-                parameters=[{"robot_description": ParameterValue(description, value_type=str)}],
-                remappings=[joint_states],
-                condition=shown,
-                output="screen",
-            ),
-            Node(
-                package="rviz2",
-                executable="rviz2",
-                arguments=["-d", layout],
-                condition=shown,
-                output="screen",
-            ),
+            GroupAction([PushROSNamespace(LaunchConfiguration("gripper_namespace")), *nodes]),
         ]
     )

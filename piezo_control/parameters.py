@@ -13,7 +13,7 @@ import difflib
 import fnmatch
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -198,22 +198,27 @@ def load(path: str | Path, node: str) -> dict[str, Any]:
     return {n: value for n, value in values.items() if n.split(".")[0] not in OF_EVERY_NODE}
 
 
-def need_one_for(path: str | Path, nodes: Iterable[str]) -> None:
-    """Raise ParameterError for a ROS parameter file that has nothing for any of the `nodes`.
+def is_for(path: str | Path, node: str) -> bool:
+    """Say whether a ROS parameter file has something for a node with its namespace, as in ``/finger/feedback``.
 
-    Nodes have their namespace, as in ``/finger/feedback``, and names match as ROS 2 matches them: ``*``
-    stands for one part of a name, ``**`` for any number of parts.
+    Names match as ROS 2 matches them: ``*`` stands for one part of a name, ``**`` for any number of parts. Raises
+    ParameterError for a file that cannot be read.
     """
-    sections = _sections(path)
     parts = {"*": r"/\w+", "**": r"(/\w+)*"}
-    for pattern in sections:
-        expression = "".join(parts.get(p, "/" + re.escape(p)) for p in pattern.split("/")[1:])
-        if any(re.fullmatch(expression, node) for node in nodes):
-            return
-    raise ParameterError(
-        f"{path}: nothing for node {' or '.join(map(repr, nodes))}; it has {list(sections)} ('/**/NAME' is "
-        "node NAME in any namespace)"
+    expressions = (
+        "".join(parts.get(p, "/" + re.escape(p)) for p in pattern.split("/")[1:])
+        for pattern in _sections(path)
     )
+    return any(re.fullmatch(expression, node) for expression in expressions)
+
+
+def need_one_for(path: str | Path, nodes: Collection[str]) -> None:
+    """Raise ParameterError for a ROS parameter file that has nothing for any of the `nodes`."""
+    if not any(is_for(path, node) for node in nodes):
+        raise ParameterError(
+            f"{path}: nothing for node {' or '.join(map(repr, nodes))}; it has {list(_sections(path))} ('/**/NAME' "
+            "is node NAME in any namespace)"
+        )
 
 
 def _sections(path: str | Path) -> dict[str, dict]:

@@ -149,7 +149,7 @@ RECORDED = (
 class RecorderParameters:
     """Where to write, and what."""
 
-    bag: str = parameter("", "folder to write, new; empty: 'finger_' and the time in this folder")
+    bag: str = parameter("", "folder to write, new; empty: namespace and time, in this folder")
     topics: tuple[str, ...] = parameter(RECORDED, "topics to record, relative or absolute")
 
 

@@ -123,7 +123,8 @@ class RecorderNode(FingerNode):
         return super().on_cleanup(state)
 
     def start(self) -> None:
-        bag = Path(self.parameters.bag or time.strftime("finger_%Y-%m-%d_%H-%M-%S"))
+        whose = self.get_namespace().strip("/").replace("/", "_") or "finger"
+        bag = Path(self.parameters.bag or f"{whose}_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
         writer = BagWriter(bag)
         self.tracks = {}
         self.newest = 0
