@@ -176,6 +176,32 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
     assert "'deflection' sample 2 is nan, must be finite" in log
 
 
+def test_a_feedback_that_is_started_again_keeps_the_reference(neighbour, tmp_path):
+    states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+    states.publish(FingerState(phase=FingerState.WAITING, reference=7e-6))
+    with node("feedback", tmp_path, controller="none"):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        neighbour.wait(lambda: states.get_subscription_count() > 0)
+        assert states.wait_for_all_acked()
+        neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
+        neighbour.tell("feedback", reference, sample(0, -2e-6))  # from now on somebody says it
+        deflection.publish(sample(1, 0.0))
+        neighbour.wait(lambda: commands[-1].number == 1)
+    assert commands[0].value == 7e-6 and commands[-1].value == -2e-6
+
+
+def test_the_finger_tells_the_reference_that_is_followed(neighbour, tmp_path):
+    followed = neighbour.node.create_publisher(Profile, "reference_followed_profile", FOLLOWED)
+    with node("cantilever", tmp_path):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        neighbour.wait(lambda: states)
+        assert math.isnan(states[0].reference)
+        followed.publish(Profile(time=[0.0], value=[7e-6]))
+        neighbour.wait(lambda: states[-1].reference == 7e-6)
+
+
 def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neighbour, tmp_path):
     """An object at 1 µm: the tip stays there, and the models say where it would be."""
     limit, away = 2e-4, 1e-6

@@ -85,7 +85,7 @@ class Reading(NamedTuple):
     time: float
     """s since sample 0, in the finger's own time."""
     reference: float
-    """m; NaN before the first that came since this client began."""
+    """m; NaN where nobody has said one."""
     deflection: float
     """m"""
     command: float
@@ -344,10 +344,7 @@ class Finger:
         node, watcher = ros.node, ros.watcher
         node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
         # Which frequencies its loop can follow the finger says, so here any sample time will do.
-        self._reference = ProfileInput(
-            node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION, self._on_reference
-        )
-        self._knows_reference = False
+        self._reference = ProfileInput(node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION)
         self._set_points = node.create_publisher(Sample, f"{self.prefix}reference", SETPOINT)
         self._waveforms = node.create_publisher(
             WaveformMessage, f"{self.prefix}reference_waveform", SETPOINT
@@ -372,13 +369,19 @@ class Finger:
         values = {name: getattr(take(), "value", nan) for name, take in self._samples.items()}
         return Reading(
             time=elapsed,
-            reference=float(self._reference.signal.at(elapsed)) if self._knows_reference else nan,
+            reference=self._reference_at(elapsed),
             temperature=getattr(
                 self._temperature(), "temperature", state.temperature if state else nan
             ),
             tip_force=state.tip_force if state else nan,
             **values,
         )
+
+    def _reference_at(self, elapsed: float) -> float:
+        """Return the reference (m) that was sent since this client began, or else that of the finger's state."""
+        if self._reference.is_known:
+            return float(self._reference.signal.at(elapsed))
+        return self.state.reference if self.state else math.nan
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
         """Return when `condition` holds; ClientError with the finger's state when it does not in time."""
@@ -503,9 +506,6 @@ class Finger:
         recorder = self.node("recorder")
         self.ros.lifecycle(recorder, "deactivate")
         self.ros.lifecycle(recorder, "cleanup")
-
-    def _on_reference(self) -> None:
-        self._knows_reference = True
 
     def _on_state(self, state: FingerState) -> None:
         self.state = state

@@ -7,7 +7,7 @@ in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profi
 out: command (Sample, m), reference_followed_profile (Profile, m), reference_followed_waveform (Waveform, m),
      push (Sample, N) with `force_control`: the force of an object, as estimated
 
-The newest of set-point, profile and waveform is followed, and what it is is said with the stamp of the first
+The newest of set-point, profile and waveform is followed; one that is started again stays at the reference of `state`, and what it is is said with the stamp of the first
 sample at which it is. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
 loop runs, with the command where it was. With `force_control`, in place of the controller, the loop follows the
@@ -213,6 +213,8 @@ class FeedbackNode(BlockNode):
         self.deflection = sample.value
         if self.parameters.mode == "free_running" and not self._is_in_time():
             return False
+        if self.finger and not self.reference.is_known:
+            self.reference.hold(self.finger.reference)  # that of a feedback before this one
         self.reference.say(sample.header)
         p, reference = self.parameters, self.reference[sample.number]
         answer.by_controller = self._has_a_rate()

@@ -59,6 +59,8 @@ class ProfileInput:
         """Force (N) that the sender allows; infinite where it says nothing."""
         self._sampled = SampledSignal(Profile([0.0], [0.0]), sample_time)
         self._is_new = True
+        self.is_known = False
+        """Whether anybody has sent one."""
         if says:
             self._profiles = node.create_publisher(
                 ProfileMessage, f"{topic}_followed_profile", FOLLOWED
@@ -82,6 +84,12 @@ class ProfileInput:
         """Read the same signal in another run, at its sample time."""
         self._sampled = SampledSignal(self._sampled.signal, sample_time)
         self._is_new = True
+
+    def hold(self, value: float) -> None:
+        """Stay at `value` where nobody has sent anything; NaN: as it is."""
+        if not (self.is_known or math.isnan(value) or value == self[0]):
+            self._sampled = SampledSignal(Profile([0.0], [value]), self._sampled.sample_time)
+            self._is_new = True
 
     def say(self, header: Header) -> None:
         """Publish what is followed from the sample with this header on, if it is new or the run is."""
@@ -137,5 +145,5 @@ class ProfileInput:
             return
         self._sampled = SampledSignal(signal, self._sampled.sample_time)
         self.max_force = max_force or math.inf
-        self._is_new = True
+        self._is_new = self.is_known = True
         self._on_change()

@@ -310,6 +310,7 @@ class ServoNode(FingerNode):
             state.since = base.wall_time(self._since)
             state.times = s.faults
             if self._last:
+                state.reference = float(self._last.reference[-1])
                 state.deflection = float(self._last.deflection[-1])
             worst = max((error for _, error in self._errors), default=np.inf)
             state.on_target = bool(

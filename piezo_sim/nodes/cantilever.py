@@ -16,6 +16,7 @@ of the loop has latched is one of the finger: it goes to rest, and its `state` s
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from time import monotonic
 from typing import Any
@@ -34,6 +35,7 @@ from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
     FAULT,
     HOLDING,
+    LARGEST_DEFLECTION,
     LARGEST_FORCE,
     LARGEST_VOLTAGE,
     NORMAL,
@@ -69,6 +71,14 @@ class CantileverNode(FingerNode):
         self.create_subscription(Fault, "fault", self._on_fault, FAULTS)
         self.faults: dict[str, str] = {}
         self.tip_force = ProfileInput(self, "tip_force", self.parameters.sample_time, LARGEST_FORCE)
+        self.follows = False
+        self.followed = ProfileInput(
+            self,
+            "reference_followed",
+            self.parameters.sample_time,
+            LARGEST_DEFLECTION,
+            self._on_followed,
+        )
         self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.watchdog = self.create_steady_timer(RETRY_PERIOD, self._watch, autostart=False)
         self.tick = self.create_steady_timer(1.0, self._tick, autostart=False)
@@ -84,6 +94,7 @@ class CantileverNode(FingerNode):
         self.limited = 0
         self.without_temperature = False
         self.tip_force.restart(p.sample_time)
+        self.followed.restart(p.sample_time)
         self.number = 0
         self.asked_again = 0
         self.sample = Sample()
@@ -233,6 +244,9 @@ class CantileverNode(FingerNode):
         elif self.active:
             self.temperatures[round(instant / self.parameters.temperature_period)] = degc
             self._advance()
+
+    def _on_followed(self) -> None:
+        self.follows = True
 
     def _advance(self) -> None:
         """Go on to the next sample when everything the present one needs is there."""
@@ -392,6 +406,7 @@ class CantileverNode(FingerNode):
         state.since = base.wall_time(self.guard.since)
         state.times = self.guard.times
         state.header.stamp = self.sample.header.stamp
+        state.reference = self.followed[self.number] if self.follows else math.nan
         state.deflection = self.sample.value
         state.voltage = self.plant.voltage
         state.tip_force = self.plant.tip_force
