@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from piezo_control.identification.measurement import MeasurementError, read_measurement
-from piezo_control.identification.table import read_table, split_name
+from piezo_control.identification.table import read_table
+from piezo_control.identification.units import split_name
 
 FORMATS = Path(__file__).parent / "data" / "formats"
 VOLTAGE = np.round(20.0 * np.sin(2.0 * np.pi * np.arange(60) / 40.0), 3)
@@ -19,6 +20,10 @@ COLUMNS = {
     "spreadsheet_de.csv": {"time": "Zeit", "voltage": "Spannung", "deflection": "Auslenkung"},
     "empty_first_column.csv": {"time": "1", "voltage": "2", "deflection": "3:um"},
     "blanks.dat": {"time": "0", "voltage": "1", "deflection": "2:um"},
+    "labview.lvm": {"time": "X_Value"},
+    "oscilloscope_head.csv": {"voltage": "CH1", "deflection": "CH2:um"},
+    "oscilloscope_units.csv": {"voltage": "A", "deflection": "B"},
+    "oscilloscope_numbers.csv": {"time": "x-axis", "voltage": "1", "deflection": "2:um"},
 }
 
 
@@ -32,48 +37,114 @@ def test_every_format_gives_the_same_measurement(path):
     assert "read 60 rows" in found.description and "voltage = column" in found.description
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    separator=st.sampled_from([",", ";", "\t", " "]),
-    comma=st.booleans(),
-    quoted=st.booleans(),
-    names=st.sampled_from(["bare", "units", "row", "none"]),
-    comment=st.sampled_from(["", "#", "%"]),
-    encoding=st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"]),
-    newline=st.sampled_from(["\n", "\r\n"]),
-    seed=st.integers(0, 10),
-)
-def test_a_measurement_comes_back_from_any_shape(
-    tmp_path_factory, separator, comma, quoted, names, comment, encoding, newline, seed
-):
-    comma = comma and separator != ","
-    random = np.random.default_rng(seed)
-    table = np.column_stack(
-        (np.arange(55) * 0.02, random.normal(0, 20, 55), random.normal(0, 9, 55))
-    )
-    lines = [f"{comment} a comment, with a comma; and more"] if comment else []
-    quote = '"' if quoted else ""
+QUANTITIES = {"time": ("s", "ms"), "voltage": ("V", "mV"), "deflection": ("um", "nm", "mm")}
+SCALES = {"s": 1.0, "ms": 1e-3, "V": 1.0, "mV": 1e-3, "um": 1e-6, "nm": 1e-9, "mm": 1e-3}
+ABOVE = {
+    "nothing": [], "comments": ["# a comment, with a comma; and more", "% another"], "sep": ["sep={}"],
+    "title": ["Finger2"], "instrument": ["Model{0}MSO44", "Sample Interval{0}0.005", "Points{0}55{0}", ""],
+}  # fmt: skip
+
+
+@st.composite
+def shapes(draw):
+    """A measurement in one of the shapes that it may be written in."""
+    separator = draw(st.sampled_from([",", ";", "\t", "|", " "]))
+    quoted = draw(st.booleans())
+    order = draw(st.permutations([*QUANTITIES, *draw(st.sampled_from([[], ["setpoint"]]))]))
+    names = draw(st.sampled_from(["bare", "units", "row", "none", "comment"]))
+    above = "nothing" if names == "none" else draw(st.sampled_from(list(ABOVE)))
+    if separator == " " and above in ("instrument", "title"):
+        above = "comments"  # its words would be as many columns
+    return {
+        "separator": separator,
+        "quoted": quoted,
+        "comma": draw(st.booleans()) and (separator != "," or quoted),
+        "order": order,
+        "units": {q: draw(st.sampled_from(units)) for q, units in QUANTITIES.items()},
+        "names": names,
+        "above": above if names != "comment" or above == "comments" else "nothing",
+        "encoding": draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "cp1252"])),
+        "newline": draw(st.sampled_from(["\n", "\r\n", "\r"])),
+        "minus": draw(st.sampled_from(["-", "−"])),
+        "end": draw(st.sampled_from(["", "\n", "\n\n"])),
+        "seed": draw(st.integers(0, 10)),
+    }
+
+
+def write(path, shape):
+    """Write 55 rows of a random measurement; return its quantities (SI) and what names their columns."""
+    random = np.random.default_rng(shape["seed"])
+    units = shape["units"]
+    table = {"time": 0.02 * np.arange(55), "voltage": random.normal(0, 20, 55),
+             "deflection": random.normal(0, 9e-6, 55), "setpoint": random.normal(0, 5, 55)}  # fmt: skip
+    texts = {
+        q: [f"{value / SCALES[units[q]] if q in units else value:.7f}" for value in values]
+        for q, values in table.items()
+    }
+    exact = {q: SCALES[units[q]] * np.array(texts[q], float) for q in units}
+    order, separator = shape["order"], shape["separator"]
+    mark = '"' if shape["quoted"] else ""
     headings = {
-        "bare": ["time", "voltage", "deflection"], "row": ["time", "voltage", "deflection"],
-        "units": ["Time(s)", "Voltage[V]", "deflection_um"], "none": [],
-    }[names]  # fmt: skip
+        "units": [f"{q.title()}({units[q]})" if q in units else q for q in order],
+        "none": [],
+    }.get(shape["names"], order)
+    lines = [line.format(separator) for line in ABOVE[shape["above"]]]
     if headings:
-        lines.append(separator.join(f"{quote}{heading}{quote}" for heading in headings))
-    if names == "row":
-        lines.append(separator.join(["s", "V", "µm"]))
-    for row in table:
-        cells = [f"{value:.6f}" for value in row]
-        if comma:
+        sign = "# " if shape["names"] == "comment" else ""
+        lines.append(sign + separator.join(f"{mark}{heading}{mark}" for heading in headings))
+    if shape["names"] == "row":
+        lines.append(separator.join(units.get(q, "V").replace("u", "µ") for q in order))
+    for cells in zip(*(texts[q] for q in order)):
+        cells = [cell.replace("-", shape["minus"]) for cell in cells]
+        if shape["comma"]:
             cells = [cell.replace(".", ",") for cell in cells]
-        lines.append(separator.join(f"{quote}{cell}{quote}" for cell in cells))
+        lines.append(separator.join(f"{mark}{cell}{mark}" for cell in cells))
+    text = shape["newline"].join(lines) + shape["end"]
+    if shape["encoding"] == "cp1252":  # has no minus but the hyphen
+        text = text.replace("−", "-")
+    path.write_bytes(text.encode(shape["encoding"]))
+    if shape["names"] in ("units", "row"):
+        return exact, {}
+    named = shape["names"] != "none"
+    return exact, {q: f"{q if named else order.index(q)}:{units[q]}" for q in units}
+
+
+@settings(max_examples=100, deadline=None)
+@given(shapes())
+def test_a_measurement_comes_back_from_any_shape(tmp_path_factory, shape):
     path = tmp_path_factory.mktemp("table") / "measured.txt"
-    path.write_bytes((newline.join(lines) + newline).encode(encoding))
-    columns = {"bare": {"deflection": "deflection:um"}, "none": {
-        "time": "0", "voltage": "1", "deflection": "2:um"}}.get(names, {})  # fmt: skip
+    exact, columns = write(path, shape)
     found = read_measurement(path, columns)
-    np.testing.assert_allclose(found.time, np.round(table[:, 0], 6), atol=1e-12)
-    np.testing.assert_allclose(found.voltage, np.round(table[:, 1], 6), atol=1e-12)
-    np.testing.assert_allclose(found.deflection, np.round(table[:, 2], 6) * 1e-6, atol=1e-16)
+    for quantity, values in exact.items():
+        np.testing.assert_allclose(getattr(found, quantity), values, rtol=1e-12, atol=1e-20)
+
+
+DAMAGES = {
+    "a word in a cell": lambda rows, k: rows[k].__setitem__(0, "low"),
+    "a cell too many": lambda rows, k: rows[k].extend(["7.0", "8.0"]),
+    "a name too few": lambda rows, k: rows[0].pop(0),
+    "a name too many": lambda rows, k: rows[0].insert(0, "number"),
+    "the time stands still": lambda rows, k: rows[k].__setitem__(0, rows[k - 1][0]),
+    "the time goes back": lambda rows, k: rows[k].__setitem__(0, "-1.0"),
+    "infinity": lambda rows, k: rows[k].__setitem__(1, "inf"),
+    "many empty cells": lambda rows, k: [row.__setitem__(1, "") for row in rows[30:]],
+    "names again": lambda rows, k: rows.insert(k, list(rows[0])),
+    "another unit": lambda rows, k: rows[0].__setitem__(2, "deflection [V]"),
+    "no voltage": lambda rows, k: [row.pop(1) for row in rows],
+    "too few rows": lambda rows, k: rows.__delitem__(slice(20, None)),
+}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(list(DAMAGES)), st.integers(2, 50), st.sampled_from(",;\t|"))
+def test_a_damaged_one_is_refused(tmp_path_factory, damage, k, separator):
+    rows = [["time", "voltage", "deflection_um"]]
+    rows += [[f"{0.02 * n:.2f}", f"{n % 7}.5", f"{n % 5}.25"] for n in range(55)]
+    DAMAGES[damage](rows, k)
+    path = tmp_path_factory.mktemp("table") / "damaged.txt"
+    path.write_text("\n".join(separator.join(row) for row in rows) + "\n")
+    with pytest.raises(MeasurementError, match="damaged.txt: "):
+        read_measurement(path)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +152,7 @@ def test_a_measurement_comes_back_from_any_shape(
     [
         ("Voltage (V)", ("Voltage", "V")), ("x [µm]", ("x", "um")), ("disp_nm", ("disp", "nm")),
         ("U / V", ("U", "V")), ("Temp [C]", ("Temp", "degc")), ("V+ [V]", ("V+", "V")),
-        ("plain", ("plain", "")), ("run_2", ("run_2", "")),
+        ("U (Volts)", ("U", "V")), ("t [seconds]", ("t", "s")), ("plain", ("plain", "")), ("run_2", ("run_2", "")),
     ],
 )  # fmt: skip
 def test_names_give_their_units(header, expected):

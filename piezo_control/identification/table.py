@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of numbers as instruments and spreadsheets write them: what is a name, a unit, a number is found.
 
-Text in any usual encoding, separated by tabs, semicolons, commas or blanks, with decimal points or commas,
-quoted or not, with comments, a line of names and one of units or without; spreadsheets (.xlsx, the first sheet); and
-what :mod:`piezo_control.identification.arrays` reads.
+Text (:mod:`piezo_control.identification.rows`), spreadsheets (.xlsx, the first sheet), and what
+:mod:`piezo_control.identification.arrays` reads.
 """
 
 from __future__ import annotations
 
-import codecs
-import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,42 +17,15 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from piezo_control.identification.arrays import READERS, absent, read_vectors
+from piezo_control.identification.rows import Row, layout, numbered, read_rows, with_points
+from piezo_control.identification.units import UNITS, split_name, unit_of
 from piezo_control.safety import LARGEST_DEFLECTION
 
-UNITS = {
-    "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0,
-    "V": 1.0, "mV": 1e-3, "kV": 1e3,
-    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9,
-    "N": 1.0, "mN": 1e-3, "uN": 1e-6,
-    "degc": 1.0,
-}  # fmt: skip
-"""Units that are understood, with what makes SI (°C for temperature) of them."""
-
-SPELLINGS = {"µ": "u", "μ": "u", "°C": "degc", "degC": "degc", "celsius": "degc", "sec": "s"}
-COMMENTS = ("#", "%")
 LARGEST_MISSING_SHARE = 0.01  # of the rows
 
 
 class TableError(ValueError):
     """A table that cannot be read; the message names file, column and row."""
-
-
-def unit_of(text: str) -> str:
-    """Return the unit that `text` spells, '' when it is none."""
-    for spelling, plain in SPELLINGS.items():
-        text = text.replace(spelling, plain)
-    text = text.strip().strip("[]()")
-    return {"C": "degc", "volt": "V", "volts": "V", "seconds": "s"}.get(text, text) if text else ""
-
-
-def split_name(header: str) -> tuple[str, str]:
-    """Return name and unit of a heading: 'Voltage (V)', 'x [µm]', 'disp_nm', 'U / V', 'Temp., °C'."""
-    match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*", header) or re.fullmatch(
-        r"(.+?)\s*(?:[/,]\s*|_)([^\s_/,]+)\s*", header
-    )
-    if match and unit_of(match[2]) in UNITS:
-        return match[1].strip(), unit_of(match[2])
-    return header.strip(), ""
 
 
 @dataclass
@@ -112,19 +82,25 @@ class Table:
         for names, sought in (
             (self.headers, name), (bases, name), (alike, plain(name)), (ends, plain(name)),
         ):  # fmt: skip
-            if names.count(sought) == 1:
-                return names.index(sought)
+            if found := [i for i, entry in enumerate(names) if entry == sought]:
+                return self._only(found, name, quantity)
         if exact:
             return None
         if name.isdigit() and int(name) < len(self.headers):
             return int(name)
-        partial = [i for i, header in enumerate(self.headers) if plain(name) in plain(header)]
-        if len(partial) > 1:
+        part = re.escape(plain(name))
+        for pattern in (rf"\b{part}\b", part):  # whole words first
+            if found := [i for i, h in enumerate(self.headers) if re.search(pattern, plain(h))]:
+                return self._only(found, name, quantity)
+        return None
+
+    def _only(self, found: list[int], name: str, quantity: str) -> int:
+        if len(found) > 1:
             raise TableError(
                 f"{self.path}: '{name}' for '{quantity}' may be any of "
-                f"{', '.join(self.headers[i] for i in partial)}"
+                f"{', '.join(self.headers[i] for i in found)}, columns {', '.join(map(str, found))}"
             )
-        return partial[0] if partial else None
+        return found[0]
 
     def numbers(self, index: int) -> NDArray[np.float64]:
         """Return a column as numbers, NaN where a cell is empty; dates become seconds since the first.
@@ -134,12 +110,13 @@ class Table:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
-        text = column.fillna("").str.strip()
-        values = pd.to_numeric(text.str.replace(self.decimal, "."), errors="coerce").to_numpy(float)
+        text = column.str.strip()
+        plain = with_points(text, self.decimal)
+        values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
         # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
         unread = np.isnan(values) & (text != "").to_numpy()
         if unread.size and unread.all():
-            dates = pd.to_datetime(text, errors="coerce", format="mixed")
+            dates = pd.to_datetime(plain, errors="coerce", format="mixed")
             if dates.notna().all():
                 return (dates - dates.iloc[0]).dt.total_seconds().to_numpy(float)
         if unread.any():
@@ -182,7 +159,7 @@ def read_columns(
     column and row.
     """
     table = read_table(path)
-    if table.headers == _numbered(len(table.headers)) and not columns:
+    if table.headers == numbered(len(table.headers)) and not columns:
         wanted = ["time", *needed] if sample_time is None else needed
         columns = _in_order(table, wanted, quantities)
     found = {q: table.find(q, columns.get(q), units) for q, units in quantities.items()}
@@ -191,7 +168,7 @@ def read_columns(
     has = f"the file has {', '.join(table.headers)}: say which column it is"
     for quantity in needed:
         if found[quantity] is None:
-            raise TableError(f"{path}: no column for '{quantity}'; {has}")
+            raise TableError(f"{path}: no column for '{quantity}'; {has}, as in --{quantity} 1")
     if found["time"] is None and sample_time is None:
         raise TableError(f"{path}: no column for 'time' and no sample time given; {has}")
     places = {quantity: place for quantity, place in found.items() if place}
@@ -232,7 +209,7 @@ def _in_order(
 
     A deflection is in the largest unit in which a finger moves that far.
     """
-    filled = np.flatnonzero(table.cells.notna().any())
+    filled = np.flatnonzero((table.cells != "").any())
     if len(filled) != len(wanted):
         return {}
     places = {quantity: str(i) for quantity, i in zip(wanted, filled)}
@@ -251,30 +228,28 @@ def read_table(path: str | Path) -> Table:
     if path.suffix.lower() == ".xlsx":
         return _read_sheet(path)
     try:
-        text = _decode(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as error:
+        rows, form = read_rows(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise TableError(f"{path}: cannot be read as text: {error}") from None
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), 1)
-        if line.strip() and not line.lstrip().startswith(COMMENTS)
-    ]
-    if not lines:
+    return _table(path, rows, form)
+
+
+def _table(path: Path, rows: list[Row], form: str) -> Table:
+    if not rows:
         raise TableError(f"{path}: no rows")
-    separator, decimal = _separator([line for _, line in lines])
     try:
-        cells = pd.read_csv(
-            io.StringIO("\n".join(line for _, line in lines)),
-            sep=separator, header=None, dtype=str, skipinitialspace=True,
-            keep_default_na=False, na_values=[""],
-        )  # fmt: skip
-    except (pd.errors.ParserError, ValueError) as error:
-        raise TableError(f"{path}: {str(error).splitlines()[0]}") from None
-    rows = np.array([number for number, _ in lines])
-    headers, units, first = _headings(cells, decimal)
-    spelled = {"\t": "tabs", r"\s+": "blanks"}.get(separator, f"'{separator}'")
-    form = f"separated by {spelled}" + (", decimal commas" if decimal == "," else "")
-    return Table(path, headers, units, cells.iloc[first:], rows[first:], decimal, form)
+        found = layout(rows)
+    except ValueError as error:
+        raise TableError(f"{path}: {error}") from None
+    if found.above:
+        form += f", {found.above} rows above the names passed over"
+    if found.decimal == ",":
+        form += ", decimal commas"
+    cells = pd.DataFrame(
+        [row.cells for row in found.rows], columns=range(len(found.names)), dtype=object
+    )
+    numbers = np.array([row.number for row in found.rows], dtype=int)
+    return Table(path, found.names, found.units, cells, numbers, found.decimal, form)
 
 
 def _read_vectors(path: Path) -> Table:
@@ -297,72 +272,5 @@ def _read_sheet(path: Path) -> Table:
         raise TableError(f"{path}: cannot be read: {absent('openpyxl')}") from None
     except Exception as error:  # of the library that takes the bytes apart, whatever they are
         raise TableError(f"{path}: cannot be read: {error}") from None
-    if cells.empty:
-        raise TableError(f"{path}: no rows")
-    rows = cells.index.to_numpy() + 1
-    headers, units, first = _headings(cells, ".")
-    return Table(path, headers, units, cells.iloc[first:], rows[first:], form="of the first sheet")
-
-
-def _decode(data: bytes) -> str:
-    """Return the text of a file by its byte-order mark, as UTF-8, or as the Windows of a lab."""
-    for mark, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-                       (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
-        if data.startswith(mark):
-            return data.decode(name)
-    if b"\0" in data:
-        raise UnicodeDecodeError(
-            "utf-8", data, data.index(b"\0"), data.index(b"\0") + 1, "binary data"
-        )
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("cp1252")
-
-
-def _separator(lines: list[str]) -> tuple[str, str]:
-    """Return separator and decimal mark, judged by the last line, which has numbers."""
-    last = lines[-1]
-    for separator in ("\t", ";"):
-        if separator in last:
-            return separator, "," if re.search(r"\d,\d", last) and "." not in last else "."
-    if "," not in last:
-        return r"\s+", "."
-    # Commas separate, unless blanks do and the commas are within numbers.
-    entries = last.split()
-    if len(entries) > 1 and all(re.fullmatch(r'"?[-+\d.,eE]+"?', e) for e in entries):
-        if not any(e.endswith(",") for e in entries):
-            return r"\s+", ","
-    return ",", "."
-
-
-def _headings(cells: pd.DataFrame, decimal: str) -> tuple[list[str], list[str], int]:
-    """Return headings, units, and the index of the first row of numbers."""
-
-    def words(row: int) -> list[str]:
-        return cells.iloc[row].fillna("").str.strip().tolist()
-
-    def are_words(entries: list[str]) -> bool:
-        numbers = pd.to_numeric(pd.Series(entries).str.replace(decimal, "."), errors="coerce")
-        given = [entry != "" for entry in entries]
-        return not numbers[given].notna().any()
-
-    first = words(0)
-    if not are_words(first) or _is_date(first[0]):
-        return _numbered(len(first)), [""] * len(first), 0
-    units = [split_name(header)[1] for header in first]
-    if len(cells) > 1:
-        second = words(1)
-        if are_words(second) and not _is_date(second[0]):
-            found = [unit_of(entry) for entry in second]
-            return first, [u if u in UNITS else unit for u, unit in zip(found, units)], 2
-    return first, units, 1
-
-
-def _numbered(columns: int) -> list[str]:
-    """Return what stands for the names in a table without any."""
-    return [str(i) for i in range(columns)]
-
-
-def _is_date(text: str) -> bool:
-    return bool(re.match(r"\d+[-/.:]\d+", text))
+    rows = [Row(n + 1, cells) for n, *cells in cells.fillna("").itertuples()]
+    return _table(path, rows, "of the first sheet")

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text as rows of cells, and which of them hold names, units and numbers.
+
+Any usual encoding; separated by tabs, semicolons, commas, bars or blanks; decimal points or commas; quoted or not; with
+comments; below whatever an instrument writes above its samples; with a row of names and one of units, or without.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import pandas as pd
+
+from piezo_control.identification.units import UNITS, split_name, unit_of
+
+COMMENTS = ("#", "%")
+JUDGED = 50  # rows at the end, which have numbers
+
+
+class Row(NamedTuple):
+    """Cells of a row, `number` counts from 1 in the file."""
+
+    number: int
+    cells: list[str]
+    comment: bool = False
+
+
+class Layout(NamedTuple):
+    """What is where: rows of numbers, as wide as there are names."""
+
+    names: list[str]  # '0', '1', … for a table without any
+    units: list[str]  # '' where none is said
+    rows: list[Row]
+    decimal: str
+    above: int  # rows above the names
+
+
+def read_rows(data: bytes) -> tuple[list[Row], str]:
+    """Return the rows of a text that are not empty, and in words how their cells are separated.
+
+    Raises ValueError for what is no text.
+    """
+    lines = [
+        (number, line) for number, line in enumerate(_decode(data).splitlines(), 1) if line.strip()
+    ]
+    written = [line for _, line in lines if not line.lstrip().startswith(COMMENTS)]
+    if not written:
+        return [], ""
+    votes = Counter(map(_separator, written[-JUDGED:]))
+    separator = votes.most_common(1)[0][0]
+    rows = []
+    for number, line in lines:
+        comment = line.lstrip().startswith(COMMENTS)
+        if comment:
+            line = line.lstrip().lstrip("".join(COMMENTS))
+        cells = _split(line, separator)
+        if any(cells):
+            rows.append(Row(number, cells, comment))
+    spelled = {"\t": "tabs", " ": "blanks"}.get(separator, f"'{separator}'")
+    return rows, f"separated by {spelled}"
+
+
+def _decode(data: bytes) -> str:
+    """Return the text of a file by its byte-order mark, as UTF-8, or as the Windows of a lab."""
+    for mark, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
+                       (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
+        if data.startswith(mark):
+            return data.decode(name)
+    if b"\0" in data:
+        raise UnicodeDecodeError(
+            "utf-8", data, data.index(b"\0"), data.index(b"\0") + 1, "binary data"
+        )
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("cp1252")
+
+
+def _separator(line: str) -> str:
+    """Return what separates the cells of a line, which has numbers."""
+    for separator in ("\t", ";", "|"):
+        if separator in line:
+            return separator
+    if "," not in line:
+        return " "
+    # Commas separate, unless blanks do and the commas are within numbers.
+    entries = line.split()
+    if len(entries) > 1 and all(re.fullmatch(r'"?[-+−\d.,eE]+"?', e) for e in entries):
+        if not any(e.endswith(",") for e in entries):
+            return " "
+    return ","
+
+
+def _split(line: str, separator: str) -> list[str]:
+    if separator == " ":
+        line = line.replace("\t", " ").strip()
+    (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
+    return [cell.strip() for cell in cells]
+
+
+def with_points(text: pd.Series, decimal: str) -> pd.Series:
+    """Return numbers as computers write them: decimal points, hyphens for minus, 'e' for Fortran's 'D'."""
+    plain = text.str.replace(decimal, ".", regex=False).str.replace("−", "-", regex=False)
+    return plain.str.replace(r"(?<=\d)[dD](?=[-+]?\d+$)", "e", regex=True)
+
+
+def _are_numbers(cells: Sequence[str], decimal: str) -> list[bool]:
+    """Tell which cells are numbers or instants."""
+    numbers = pd.to_numeric(with_points(pd.Series(cells, dtype=object), decimal), errors="coerce")
+    return [
+        known or bool(re.match(r"\d+[-/.:]\d+", cell))
+        for known, cell in zip(numbers.notna().tolist(), cells)
+    ]
+
+
+def numbered(columns: int) -> list[str]:
+    """Return what stands for the names in a table without any."""
+    return [str(i) for i in range(columns)]
+
+
+def layout(rows: list[Row]) -> Layout:
+    """Find names, units and numbers.
+
+    The rows at the end show how many columns there are and which of them hold numbers; the names are in the last
+    row of words above the first row that looks like these, or in a comment right above it. Raises ValueError for a
+    row with more cells than columns, and for names that are not as many.
+    """
+    shown = [row.cells for row in rows if not row.comment][-JUDGED:]
+    width = Counter(map(len, shown)).most_common(1)[0][0]
+    shown = [cells for cells in shown if len(cells) == width]
+    decimal = _decimal(shown)
+    votes = [_are_numbers(cells, decimal) for cells in shown]
+    numeric = [i for i in range(width) if 2 * sum(vote[i] for vote in votes) > len(votes)]
+
+    def fits(row: Row) -> bool:
+        given = [i for i in numeric if i < len(row.cells) and row.cells[i]]
+        known = _are_numbers(row.cells, decimal)
+        return not row.comment and bool(given) and all(known[i] for i in given)
+
+    def of_words(row: Row) -> bool:
+        return not any(_are_numbers(row.cells, decimal))
+
+    first = next((i for i, row in enumerate(rows) if fits(row)), len(rows))
+    at = next(
+        (i for i in range(first - 1, -1, -1) if not rows[i].comment and of_words(rows[i])), -1
+    )
+    if at < 0 and first and rows[first - 1].comment and of_words(rows[first - 1]):
+        at = first - 1 if len(rows[first - 1].cells) == width else -1
+    if at >= 0 and at < first - 1 and _length(rows[at].cells) == 1:
+        at = -1
+    below = [row for row in rows[at + 1 :] if not row.comment]
+    names, units = numbered(width), [""] * width
+    if at >= 0 and not (_length(rows[at].cells) == 1 < width):
+        names, units, at = _named(rows, at, width)
+        filled = max(map(_length, shown))
+        if not filled <= len(names) <= width:
+            raise ValueError(
+                f"row {rows[at].number} has {len(names)} names, the rows below it have {filled} cells: which is "
+                "which cannot be known; make them equally many"
+            )
+        names, units = ((entries + [""] * width)[:width] for entries in (names, units))
+    for row in below:
+        if any(row.cells[width:]):
+            raise ValueError(
+                f"row {row.number} has {len(row.cells)} cells, must have at most {width}"
+            )
+    whole = [Row(row.number, (row.cells + [""] * width)[:width]) for row in below]
+    return Layout(names, units, whole, decimal, sum(not row.comment for row in rows[: max(at, 0)]))
+
+
+def _decimal(shown: list[list[str]]) -> str:
+    """Return the decimal mark: a comma where some cells are numbers with one, and none with a point."""
+    cells = [cell for cells in shown for cell in cells]
+    commas = any(re.fullmatch(r"[-+−]?\d*,\d+([eE][-+]?\d+)?", cell) for cell in cells)
+    points = any(re.fullmatch(r"[-+−]?[\d,]*\.\d*([eE][-+]?\d+)?", cell) for cell in cells)
+    return "," if commas and not points else "."
+
+
+def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], int]:
+    """Return names, units, and the index of the row of names, of words in row `at`: names, or units below them."""
+    words = rows[at].cells[: _length(rows[at].cells)]
+    told = [unit_of(word) for word in words]
+    given = [unit in UNITS for unit, word in zip(told, words) if word]
+    if at and not rows[at - 1].comment and 2 * sum(given) >= len(given):
+        names = rows[at - 1].cells[: _length(rows[at - 1].cells)]
+        told += [""] * len(names)
+        return names, [u if u in UNITS else split_name(n)[1] for u, n in zip(told, names)], at - 1
+    return words, [split_name(word)[1] for word in words], at
+
+
+def _length(cells: list[str]) -> int:
+    """Return how many cells there are up to the last one that is not empty."""
+    return max((i for i, cell in enumerate(cells, 1) if cell), default=0)
