@@ -19,10 +19,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 101))
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 import fault_bench
 import fault_events
+import own_domain
 from fault_bench import NODES, Bench, Network
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from std_srvs.srv import Trigger
@@ -164,6 +163,7 @@ def main() -> int:
         help="folder for results.jsonl, where schedules count as done, and the logs of those that failed",
     )  # fmt: skip
     arguments = parser.parse_args()
+    own_domain.take()
     out: Path = arguments.out
     out.mkdir(parents=True, exist_ok=True)
     results = out / "results.jsonl"

@@ -58,6 +58,7 @@ from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 LOOK_PERIOD = 0.02  # s, between two looks at something that is waited for
+ASK_AGAIN = 0.5  # s, for what can be asked more than once
 FIRST_MESSAGE = 0.3  # s in which the first message of a topic comes, if it does
 LEAD_TIME = 0.1  # s of the finger's time from sending a waveform to its start
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -198,6 +199,7 @@ class Ros:
         """Return all parameters of a node."""
         client = AsyncParameterClient(self.node, node)
         self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
+        self.meet(node)
         names = sorted(self.result(client.list_parameters([], 0), node).result.names)
         values = self.result(client.get_parameters(names), node).values
         return dict(zip(names, map(parameter_value_to_python, values), strict=True))
@@ -206,6 +208,7 @@ class Ros:
         """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
         client = AsyncParameterClient(self.node, node)
         self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
+        self.meet(node)
         changes = [Parameter(name, value=value) for name, value in values.items()]
         result = self.result(client.set_parameters_atomically(changes), node).result
         if not result.successful:
@@ -229,7 +232,26 @@ class Ros:
         client = self.node.create_client(kind, service)
         try:
             self.wait(client.service_is_ready, lambda: f"nobody serves '{service}'")
+            self.meet(service.rpartition("/")[0])
             return self.result(client.call_async(request), service)
+        finally:
+            self.node.destroy_client(client)
+
+    def meet(self, node: str) -> None:
+        """Ask a node for its state until it answers; from then on it has met every client that was made before.
+
+        What a node answers to a client that it has not met yet is lost, and most questions cannot be asked twice.
+        """
+        client = self.node.create_client(GetState, f"{node}/get_state")
+        answered = threading.Event()
+        end = time.monotonic() + self.timeout
+        try:
+            self.wait(client.service_is_ready, lambda: f"'{node}' does not answer")
+            while not answered.is_set():
+                if time.monotonic() > end:
+                    raise ClientError(f"'{node}' has not answered for {self.timeout:g} s")
+                client.call_async(GetState.Request()).add_done_callback(lambda _: answered.set())
+                answered.wait(ASK_AGAIN)
         finally:
             self.node.destroy_client(client)
 
@@ -298,6 +320,7 @@ class Gripper:
             raise ClientError(f"'{self.node}': {error}") from None
         self.ros.wait(lambda: self._problem() == "", lambda: f"'{self.node}': {self._problem()}")
         self.ros.wait(self._grip.server_is_ready, lambda: f"'{self.node}' has no action 'grip'")
+        self.ros.meet(self.node)
         goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
         handle = self.ros.ask(
             self.node, self._grip.send_goal_async, goal, lambda m: on_feedback(m.feedback)
