@@ -36,10 +36,10 @@ sensorless: env
 	$(RUN) python -m piezo_sim.experiment.sensorless --out out/sensorless
 
 grasp: env
-	$(RUN) python -m piezo_sim.experiment.on_nodes.grasp --out out/grasp
+	$(RUN) python -m piezo_sim.experiment.on_nodes.grasp --out out/grasp --overwrite
 
 servo: env
-	$(RUN) python -m piezo_sim.experiment.on_nodes.servo --out out/servo
+	$(RUN) python -m piezo_sim.experiment.on_nodes.servo --out out/servo --overwrite
 
 bench: env
 	$(RUN) python bench/run.py --out out/bench.json

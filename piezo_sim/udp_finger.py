@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import signal
 import socket
 import struct
@@ -195,6 +196,8 @@ def main() -> int:
         "--priority",
         type=int,
         default=0,
+        choices=range(100),
+        metavar="0 … 99",
         help="of the real-time scheduler, 0: ordinary (%(default)s)",
     )
     parser.add_argument(
@@ -207,6 +210,12 @@ def main() -> int:
         signal.signal(number, lambda *_: stopped.set())
     try:
         plant = CantileverParameters()
+        if not (
+            math.isfinite(arguments.scale) and arguments.scale and math.isfinite(arguments.zero)
+        ):
+            raise ParameterError(
+                f"--scale is {arguments.scale:g}, must be finite and not 0; --zero is {arguments.zero:g}, must be finite"
+            )
         if arguments.cantilever:
             values = load(arguments.cantilever, "cantilever")
             plant = build(CantileverParameters, values, arguments.cantilever)
@@ -214,14 +223,18 @@ def main() -> int:
             plant, arguments.host, arguments.port, None, arguments.priority, arguments.scale,
             arguments.zero,
         )  # fmt: skip
+        finger.start()
     except (ParameterError, OSError, OverflowError) as error:
         print(f"udp_finger: {error}", file=sys.stderr)
         return 2
-    finger.start()
     print(f"udp_finger: answers at {arguments.host}:{finger.port}", flush=True)
     stopped.wait()
     report = asdict(finger.stop())
     print(json.dumps(report))
     if arguments.report:
-        Path(arguments.report).write_text(json.dumps(report, indent=2) + "\n")
+        try:
+            Path(arguments.report).write_text(json.dumps(report, indent=2) + "\n")
+        except OSError as error:
+            print(f"udp_finger: --report {arguments.report}: {error.strerror}", file=sys.stderr)
+            return 1
     return 0

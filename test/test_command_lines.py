@@ -19,11 +19,15 @@ from hypothesis import strategies as st
 from piezo_control.design import cli as design
 from piezo_control.design.problem import SynthesisError
 from piezo_control.identification import cli as identification
+from piezo_control.nodes import fingerctl
 from piezo_control.parameters import ParameterError
 from piezo_control.servo import commission
+from piezo_sim import udp_finger
 from piezo_sim.experiment import cli as experiment
 from piezo_sim.experiment import monte_carlo
 from piezo_sim.experiment.cases import params_folder
+from piezo_sim.experiment.on_nodes import grasp
+from piezo_sim.experiment.on_nodes import servo as servo_study
 
 NUMBERS = (
     "0",
@@ -82,6 +86,8 @@ def files(tmp_path_factory):
         patch.setattr(design, "synthesize", leave_out)
         patch.setattr(monte_carlo, "run_draws", functools.partial(leave_out, error=ParameterError))
         patch.setattr(commission, "commission", leave_out)
+        answers = functools.partial(leave_out, error=ParameterError)
+        patch.setattr(udp_finger.UdpFinger, "start", answers)
         yield sorted(path.name for path in folder.iterdir())
 
 
@@ -116,6 +122,26 @@ COMMANDS = {
     "synthesize": (design.main, [[], [str(params_folder() / "synthesis_robust.yaml")]]),
     "monte_carlo": (monte_carlo.main, [[], ["robust"]]),
     "commission": (commission.main, [[]]),
+    "udp_finger": (udp_finger.main, [[]]),
+    # No finger is there, and nobody waits for one.
+    "fingerctl": (
+        fingerctl.main,
+        [
+            ["--timeout", "0.05", *words]
+            for words in (
+                ["set"],
+                ["wave", "sine"],
+                ["grip"],
+                ["watch"],
+                ["params", "feedback"],
+                ["lifecycle"],
+                ["record"],
+                ["control"],
+                ["state"],
+                [],
+            )
+        ],
+    ),
 }
 
 
@@ -136,7 +162,7 @@ def test_any_words_end_in_an_exit_code(name, files):
     @given(st.sampled_from(commands), st.lists(word, max_size=2), st.lists(option, max_size=3))
     def words_of_any_kind(command, positional, given_options):
         given_words = [*command, *positional, *itertools.chain(*given_options)]
-        if "--out" not in given_words:
+        if "--out" in known and "--out" not in given_words:
             given_words += ["--out", f"new{next(numbers)}"]
         code, said, _ = run(main, given_words)
         assert code in (0, 1, 2), given_words
@@ -144,3 +170,11 @@ def test_any_words_end_in_an_exit_code(name, files):
         assert "Traceback" not in said
 
     words_of_any_kind()
+
+
+@pytest.mark.parametrize("study", [servo_study, grasp])
+def test_a_study_leaves_a_folder_alone_that_holds_something(study, tmp_path):
+    (tmp_path / "thesis").write_text("years of work")
+    code, said, _ = run(study.main, ["--out", str(tmp_path)])
+    assert code == 2 and f"{tmp_path} is not empty" in said
+    assert (tmp_path / "thesis").read_text() == "years of work"

@@ -7,9 +7,7 @@ Every figure is computed from the recorded bags; `analyse` and `compare` do the 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import re
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,6 +24,7 @@ from piezo_sim.experiment.analysis import ANALYSES
 from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, not_covered, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
 from piezo_sim.experiment.report import Section, print_table, write_html
+from piezo_sim.experiment.study import results_folder
 
 EXPERIMENTS = {
     "step": "step of the reference and of the temperature (Fig. 13): `make demo`",
@@ -264,27 +263,3 @@ def overrides(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the experiment keys given on the command line."""
     given = {name: getattr(arguments, name) for name in OVERRIDES}
     return {name: value for name, value in given.items() if value is not None}
-
-
-@contextlib.contextmanager
-def results_folder(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder beside `out` for results, which take their place in `out` when all went well.
-
-    What is in `out` under other names stays. After a failure the folder is left as it is, for its logs.
-    Raises FileExistsError if `out` is a file, or holds something and may not be replaced.
-    """
-    if out.exists() and not out.is_dir():
-        raise FileExistsError(f"--out is {out}, which is a file; name a folder")
-    if out.exists() and any(out.iterdir()) and not overwrite:
-        raise FileExistsError(f"{out} is not empty; name a new --out or give --overwrite")
-    folder = out.with_name(f"{out.name}.unfinished")
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    yield folder
-    out.mkdir(exist_ok=True)
-    for made in folder.iterdir():
-        replaced = out / made.name
-        if replaced.is_dir():
-            shutil.rmtree(replaced)
-        made.replace(replaced)
-    folder.rmdir()

@@ -9,8 +9,6 @@ that are alike.
 from __future__ import annotations
 
 import argparse
-import json
-import shutil
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -25,13 +23,13 @@ from rich.console import Console
 
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.nodes.client import ClientError, Finger, Gripper, connect
-from piezo_control.parameters import ParameterError
 from piezo_control.recording.reader import open_bag
-from piezo_control.recording.recording import SAMPLE_TYPE, BagError, Recording, read
+from piezo_control.recording.recording import SAMPLE_TYPE, Recording, read
 from piezo_gripper_msgs.msg import FingerState
+from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
-from piezo_sim.experiment.report import Section, print_table, write_html
+from piezo_sim.experiment.report import Section
 from piezo_sim.plant.cantilever import CantileverParameters
 
 SIDES = ("left", "right")
@@ -216,27 +214,19 @@ def draw(runs: dict[str, list[Grasp]], path: Path) -> Path:
     return path
 
 
-def main() -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m piezo_sim.experiment.on_nodes.grasp", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/grasp"))
-    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
-    arguments = parser.parse_args()
-    out, console = arguments.out, Console()
-    try:
-        shutil.rmtree(out, ignore_errors=True)
-        runs = {}
-        for name in arguments.ways:
-            with console.status(f"{WAYS[name].title}: {CARRIED_UNTIL:g} s of two fingers"):
+def work(
+    arguments: argparse.Namespace, out: Path, console: Console
+) -> tuple[dict[str, Any], list[Section]]:
+    """Pick, hold, carry and place in every way that is asked for, and draw what came of it."""
+    runs = {}
+    for name in arguments.ways:
+        with console.status(f"{WAYS[name].title}: {CARRIED_UNTIL:g} s of two fingers"):
+            try:
                 bags = run(WAYS[name], out / name)
-                runs[name] = [recorded(bag) for bag in bags.values()]
-    except (RunFailed, ClientError, BagError, ParameterError, OSError) as error:
-        print(f"grasp: {error}", file=sys.stderr)
-        return 1
+            except ClientError as error:
+                raise RunFailed(str(error)) from None
+            runs[name] = [recorded(bag) for bag in bags.values()]
     found = {name: figures(grasps) for name, grasps in runs.items()}
-    (out / "metrics.json").write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     picture = draw(runs, out / "grasp.png")
     rows = [
         [key, *(f"{found[name][key]:.3f}" for name in runs)] for key in next(iter(found.values()))
@@ -246,10 +236,14 @@ def main() -> int:
         [(picture, "Force of the bead on the tips, opening, temperature.")],
         ["figure", *(WAYS[name].title for name in runs)], rows,
     )  # fmt: skip
-    write_html(out / "report.html", "A bead between two fingers", [section])
-    print_table(console, section)
-    print(f"report: {out / 'report.html'}")
-    return 0
+    return found, [section]
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    parser = study.parser("piezo_sim.experiment.on_nodes.grasp", __doc__)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
+    return study.run(parser.parse_args(), "A bead between two fingers", work)
 
 
 if __name__ == "__main__":

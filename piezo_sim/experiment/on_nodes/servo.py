@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import socket
 import sys
 import time
@@ -24,15 +23,15 @@ from rich.console import Console
 
 from piezo_control.metrics import step_metrics
 from piezo_control.nodes import spin
-from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.reader import open_bag
-from piezo_control.recording.recording import BLOCK_TYPE, BagError, Recording, read
+from piezo_control.recording.recording import BLOCK_TYPE, Recording, read
 from piezo_gripper_msgs.msg import FingerState
+from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
 from piezo_sim.experiment.on_nodes.conductor import Conductor
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
-from piezo_sim.experiment.report import Section, print_table, write_html
+from piezo_sim.experiment.report import Section
 
 STEP = 20e-6  # m
 LEAD = 0.2  # s from the order to the step
@@ -153,32 +152,26 @@ def draw(recording: Recording, late: np.ndarray, path: Path) -> Path:
     return path
 
 
-def main() -> int:
-    """Run the command line and return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m piezo_sim.experiment.on_nodes.servo", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/servo"))
-    out = parser.parse_args().out
-    try:
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir(parents=True)
+def work(
+    arguments: argparse.Namespace, out: Path, console: Console
+) -> tuple[dict[str, Any], list[Section]]:
+    """Run the step and draw what came of it."""
+    with console.status("a step of 20 µm at 10 kHz; at first the loops are compiled"):
         bag, seen = run(out)
-        found, recording, late = figures(bag, seen)
-    except (RunFailed, BagError, ParameterError, OSError) as error:
-        print(f"servo: {error}", file=sys.stderr)
-        return 1
-    (out / "metrics.json").write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    found, recording, late = figures(bag, seen)
     picture = draw(recording, late, out / "servo.png")
     rows = [[name, f"{value:.4g}"] for name, value in found.items()]
     section = Section(
         "10 kHz in real time, over UDP", TEXT, [(picture, "Step of 20 µm; lateness of the periods.")],
         ["figure", "value"], rows,
     )  # fmt: skip
-    write_html(out / "report.html", "The servo", [section])
-    print_table(Console(), section)
-    print(f"report: {out / 'report.html'}")
-    return 0
+    return found, [section]
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    parser = study.parser("piezo_sim.experiment.on_nodes.servo", __doc__)
+    return study.run(parser.parse_args(), "The servo", work)
 
 
 if __name__ == "__main__":
