@@ -3,13 +3,22 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
-from piezo_control.identification.dynamics import identify_dynamics
-from piezo_control.identification.measurement import Measurement, MeasurementError
+from piezo_control.identification.dynamics import (
+    DynamicsModel,
+    identify_dynamics,
+    need_vibration,
+)
+from piezo_control.identification.measurement import (
+    Measurement,
+    MeasurementError,
+    read_measurement,
+)
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 
 SAMPLE_TIME = 1e-4
@@ -105,3 +114,29 @@ def test_a_delay_is_found_and_is_not_taken_for_damping(late):
     assert model.delay_samples == late
     assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
     assert model.damping_ratio == pytest.approx(DAMPING, rel=0.1)
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.3, 0.9])
+def test_a_vibration_under_noise_is_seen(damping):
+    """2 % of the stroke, white: from a ringing finger to one that hardly overshoots."""
+    time = np.arange(2000) * SAMPLE_TIME
+    voltage = np.where(time < 0.01, 0.0, 20.0)
+    exact = DynamicsModel(2.0 * np.pi * 300.0, damping, 5e-7, 0.0, 0.0, 0).deflection(time, voltage)
+    noisy = exact + np.random.default_rng(0).normal(0.0, 0.02 * 1e-5, time.size)
+    measurement = Measurement("sim", time, voltage, noisy, None, None, np.arange(time.size))
+    model = identify_dynamics(measurement, voltage)
+    need_vibration(measurement, voltage, model)
+    assert model.natural_frequency == pytest.approx(2.0 * np.pi * 300.0, rel=0.03)
+
+
+def test_the_width_of_slow_loops_is_not_taken_for_damping():
+    """The p885 stack at 1 Hz: a resonance of 7.6 Hz, damped by 0.37, leaves 1.4 % of the stroke."""
+    path = Path(__file__).parent / "data" / "p885_hysteresis" / "Model_Vi_Do.dat"
+    measurement = read_measurement(path, {"voltage": "0", "deflection": "4:um"}, sample_time=5e-3)
+    model = identify_dynamics(measurement, measurement.voltage)
+    left = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
+    assert np.sqrt(np.mean(left**2)) < 0.02 * np.ptp(measurement.deflection)
+    with pytest.raises(
+        MeasurementError, match="no vibration is seen; drive the finger with a step"
+    ):
+        need_vibration(measurement, measurement.voltage, model)

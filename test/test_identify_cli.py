@@ -21,6 +21,7 @@ from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
 from piezo_control.recording.writer import write_recording
 from piezo_sim.engine import drive, run
+from piezo_sim.experiment import cli as experiment
 from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
@@ -50,6 +51,15 @@ def recorded(bag, plant, voltage, duration, tip_force=ZERO):
     return bag
 
 
+def largest_error(plant, feedforward):
+    """Return how far (% of the stroke) the finger is from 1 Hz, +-20 µm, after the first of three cycles."""
+    time = np.arange(3001) * 1e-3
+    reference = Profile(time, 20e-6 * np.sin(2.0 * np.pi * time), linear=True)
+    result = run(plant, feedforward, FeedbackParameters(), CONSTANT, reference, 3000)
+    error = np.abs(result.true_deflection - np.roll(result.reference, 1))
+    return 100.0 * error[1000:].max() / 40e-6
+
+
 def test_excite_identify_linearise_a_plant_of_another_class(identify, tmp_path):
     """The whole chain: the loaded parameters keep 1 Hz, +-20 um within 2.5 % of the stroke."""
     plant = CantileverParameters(plant="truth", sample_time=1e-3)
@@ -57,22 +67,44 @@ def test_excite_identify_linearise_a_plant_of_another_class(identify, tmp_path):
     assert identify("hysteresis", bag) == 0
     path = tmp_path / "identified" / "feedforward.yaml"
     identified = build(FeedforwardParameters, load(path, "feedforward"), str(path))
+    assert largest_error(plant, identified) <= 2.5
+    straight = FeedforwardParameters(compensator="static_gain", static_gain=identified.static_gain)
+    assert largest_error(plant, straight) > 7.0
 
-    time = np.arange(3001) * 1e-3
-    reference = Profile(time, 20e-6 * np.sin(2.0 * np.pi * time), linear=True)
-    peak = {}
-    for name, feedforward in (
-        ("inverse", identified),
-        (
-            "static_gain",
-            FeedforwardParameters(compensator="static_gain", static_gain=identified.static_gain),
-        ),
-    ):
-        result = run(plant, feedforward, FeedbackParameters(), CONSTANT, reference, 3000)
-        error = np.abs(result.true_deflection - np.roll(result.reference, 1))
-        peak[name] = 100.0 * error[1000:].max() / 40e-6  # after the first of three cycles
-    assert peak["inverse"] <= 2.5
-    assert peak["static_gain"] > 7.0
+
+def spreadsheet(path, result):
+    """Write a run as a German spreadsheet saves it: each deflection beside the voltage that it follows."""
+    before = (
+        2  # samples: the sensor's delay, and that a voltage is held from one sample to the next
+    )
+    rows = zip(result.time[before:], result.voltage[:-before], 1e6 * result.deflection[before:])
+    lines = ["Messung 3;;", "Zeit (s);Spannung (V);Auslenkung (µm)"]
+    lines += [
+        f"{t - result.time[before]:.5f};{v:.5f};{d:.4f}".replace(".", ",") for t, v, d in rows
+    ]
+    path.write_bytes(("\r\n".join(lines) + "\r\n").encode("cp1252"))
+    return path
+
+
+def test_the_same_chain_from_a_spreadsheet(identify, monkeypatch, tmp_path):
+    """Excite, identify hysteresis and dynamics of two tables, run an experiment with what was found."""
+    slow = CantileverParameters(plant="truth", sample_time=1e-3)
+    quick = CantileverParameters(plant="truth")
+    words = ("--time", "Zeit", "--voltage", "Spannung", "--deflection", "Auslenkung")
+    excited = drive(slow, CONSTANT, decaying_sine(40.0, cycles=20), 20_000)
+    stepped = drive(quick, CONSTANT, Profile([0.0, 2e-3], [0.0, 40.0]), 800)
+    assert identify("hysteresis", spreadsheet(tmp_path / "excite.csv", excited), *words) == 0
+    assert identify("dynamics", spreadsheet(tmp_path / "step.csv", stepped), *words) == 0
+    out = tmp_path / "identified"
+    path = out / "feedforward.yaml"
+    assert largest_error(slow, build(FeedforwardParameters, load(path, "feedforward"))) <= 2.5
+    found = build(CantileverParameters, load(out / "cantilever.yaml", "cantilever"))
+    np.testing.assert_allclose(found.dynamics.denominator, (5.7e-8, 8.1e-6, 1.0), rtol=0.1)
+    command = ["experiment", "feedforward", "--engine", "--plant", "truth", "--params", str(out)]
+    monkeypatch.setattr(sys, "argv", [*command, "--out", str(tmp_path / "verified")])
+    assert experiment.main() == 0
+    rows = json.loads((tmp_path / "verified" / "metrics.json").read_text())
+    assert rows
 
 
 def test_every_step_ends_in_one_cantilever_file(identify, tmp_path):
@@ -150,6 +182,9 @@ def test_measured_actuator_from_its_file(identify, tmp_path, model, plays, limit
         (("stiffness", P885, *P885_COLUMNS[:-2]), "no column 'tip_force'"),
         (("check", P885, *P885_COLUMNS), "feedforward.yaml: cannot be read"),
         (("hysteresis", "none.csv"), "none.csv: cannot be read"),
+        (("hysteresis", P885, *P885_COLUMNS, "--voltage", "4"), "column '4' cannot be both"),
+        (("hysteresis", P885, *P885_COLUMNS, "--start", "50"), "0 samples, must be at least 50"),
+        (("dynamics", P885, *P885_COLUMNS[:-2]), "no vibration is seen"),
     ],
 )  # fmt: skip
 def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, arguments, message):
@@ -181,7 +216,7 @@ def table(path, voltage, deflection, force=None, temperature=None, rate=200.0):
         # A loop that one play in every second cycle does not follow: twice the stroke.
         ("hysteresis", "a straight line", (LOOP, 0.5 * LOOP * np.repeat([1.0, 0.85], 1000))),
         # A finger that answers at once, and its sensor's slow error: nothing vibrates.
-        ("dynamics", "a finger without vibration", (LOOP, 0.5 * LOOP + 2.0 * np.sin(np.arange(2000) / 150.0))),
+        ("dynamics", "vibration", (LOOP, 0.5 * LOOP + 2.0 * np.sin(np.arange(2000) / 150.0))),
         # A force that does nothing, and a knock at the table.
         ("stiffness", "no force", (0.0 * LOOP, 5.0 * (np.arange(2000) // 8 == 78), LOOP > 0.0)),
         # A deflection that neither creep nor heat explains.
@@ -247,6 +282,17 @@ def test_only_the_asked_part_of_a_recording_is_used(identify, tmp_path):
     assert identify("hysteresis", P885, *P885_COLUMNS, "--start", 5, "--end", 25) == 0
     fits = json.loads((tmp_path / "identified" / "hysteresis.json").read_text())
     assert "all 3600 samples, fitted" in fits  # without the 400 to skip
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--skip=-5", "--plays=0", "--dead-zones=-1", "--sample-rate=0", "--sample-rate=nan", "--start=nan",
+     "--end=-1", "--lag=inf", "--hold-back=1", "--sensor-delay=-1"],
+)  # fmt: skip
+def test_an_option_out_of_its_range_is_refused(identify, capsys, option):
+    with pytest.raises(SystemExit):
+        identify("hysteresis", P885, option)
+    assert "is not within [" in capsys.readouterr().err
 
 
 def test_nothing_is_replaced_unasked_and_no_bad_fit_is_written(identify, tmp_path, capsys):

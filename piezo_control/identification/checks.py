@@ -52,7 +52,7 @@ def reversed_sensor(
     return _refuse(
         measurement,
         f"column 'deflection' falls while '{drive}' rises ({seen}): the sign of the sensor is reversed; --reversed "
-        "reads it the other way round, and makes the servo do so",
+        "(or leaving it away) reads it the other way round",
     )
 
 

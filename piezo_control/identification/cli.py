@@ -27,10 +27,10 @@ from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
-from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
+from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns, within
 from piezo_control.identification.confidence import Values, lines
 from piezo_control.identification.drift import identify_drift
-from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics
+from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics, need_vibration
 from piezo_control.identification.fit import FitQuality, need, quality, straight
 from piezo_control.identification.hysteresis import (
     HysteresisModel,
@@ -213,6 +213,8 @@ def finish_dynamics(
     if model.gain < 0.0:
         what = "voltage" if less else "tip_force"
         raise checks.reversed_sensor(measurement, f"gain {model.gain:.3g}", what)
+    if less:
+        need_vibration(measurement, drive, model)
     modelled = model.deflection(measurement.time, drive)
     fit = quality(
         measurement.deflection,
@@ -441,13 +443,20 @@ def parse() -> argparse.Namespace:
         "--run", dest="run_number", type=int, metavar="N", help="which of several runs"
     )
     bag.add_argument(
-        "--sensor-delay", type=int, default=1, metavar="SAMPLES", help="age of a deflection (1)"
+        "--sensor-delay",
+        type=within(int, 0, 1000),
+        default=1,
+        metavar="SAMPLES",
+        help="age of a deflection (1)",
     )
     reading.add_argument(
         "--out", "-o", type=Path, default=Path("out/identified"), help="folder (out/identified)"
     )
-    reading.add_argument("--start", type=float, default=0.0, metavar="S", help="use from here on")
-    reading.add_argument("--end", type=float, default=np.inf, metavar="S", help="use up to here")
+    for name, default, text in (
+        ("--start", 0.0, "use from here on"),
+        ("--end", np.inf, "use up to here"),
+    ):
+        reading.add_argument(name, type=within(float, 0.0), default=default, metavar="S", help=text)
 
     parser = argparse.ArgumentParser(
         prog="identify", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -471,38 +480,38 @@ def parse() -> argparse.Namespace:
         help="with dead zones for asymmetric actuators (default), or without",
     )  # fmt: skip
     fit.add_argument("--overwrite", action="store_true", help="replace an earlier result in --out")
-    fit.add_argument("--plays", type=int, default=20, metavar="N", help="equal thresholds (20)")
+    fit.add_argument(
+        "--plays", type=within(int, 1, 1000), default=20, metavar="N", help="equal thresholds (20)"
+    )
     fit.add_argument("--thresholds", type=volts, metavar="V,V,...", help="thresholds instead")
-    fit.add_argument("--dead-zones", type=int, default=3, metavar="N", help="on either side (3)")
+    fit.add_argument(
+        "--dead-zones", type=within(int, 0, 100), default=3, metavar="N", help="on either side (3)"
+    )
     fit.add_argument(
         "--lag", type=seconds, metavar="S",
         help="lag of the deflection, or 'identify'; default: known of bags, 'identify' for text files",
     )  # fmt: skip
     fit.add_argument(
-        "--skip", type=int, metavar="SAMPLES",
+        "--skip", type=within(int, 0), metavar="SAMPLES",
         help="not fitted; default: until the voltage has been to both ends",
     )  # fmt: skip
     fit.add_argument(
-        "--hold-back", type=share, default=0.3, metavar="SHARE", help="of the samples (0.3)"
+        "--hold-back",
+        type=within(float, 0.0, 0.9),
+        default=0.3,
+        metavar="SHARE",
+        help="of the samples (0.3)",
     )
-    command(check).add_argument("--skip", type=int, metavar="SAMPLES", help="not judged")
+    command(check).add_argument("--skip", type=within(int, 0), metavar="SAMPLES", help="not judged")
     command(dynamics)
     command(stiffness)
     command(drift, several=True)
     return parser.parse_args()
 
 
-def share(text: str) -> float:
-    """Return a number from 0 to 0.9."""
-    value = float(text)
-    if not 0.0 <= value <= 0.9:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 0.9")
-    return value
-
-
 def seconds(text: str) -> float | str:
     """Return a number of seconds, or the word 'identify'."""
-    return text if text == "identify" else float(text)
+    return text if text == "identify" else within(float, -1e3, 1e3)(text)
 
 
 def volts(text: str) -> tuple[float, ...]:

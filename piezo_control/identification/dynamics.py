@@ -26,6 +26,7 @@ from piezo_control.identification.measurement import Measurement, MeasurementErr
 
 FREQUENCIES = 150  # tried before the search, from one cycle in the measurement to Nyquist
 LONGEST_DELAY = 8  # samples
+LARGEST_LEFT = 0.5  # of what was measured around the resonance
 STEP = 1e-6  # relative, of a derivative
 DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
 
@@ -110,9 +111,9 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
         x = np.linalg.lstsq(matrix / scale, measurement.deflection, rcond=None)[0] / scale
         return x, measurement.deflection - matrix @ x
 
-    nyquist = math.pi / sample_time
+    lowest, nyquist = 2.0 * math.pi / time[-1], math.pi / sample_time
     start = min(
-        ((w, d) for w in np.geomspace(2.0 * math.pi / time[-1], 0.98 * nyquist, FREQUENCIES)
+        ((w, d) for w in np.geomspace(lowest, 0.98 * nyquist, FREQUENCIES)
          for d in DAMPING_RATIOS),
         key=lambda guess: float(np.sum(linear(guess[0], guess[1], 0)[1] ** 2)),
     )  # fmt: skip
@@ -124,6 +125,7 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
         found = least_squares(
             lambda x, delay=delay: linear(math.exp(x[0]), math.exp(x[1]), delay)[1] / spread,
             logs,
+            bounds=np.log([(0.1 * lowest, 1e-6), (10.0 * nyquist, 1e2)]),
             x_scale=(1e-3, 1e-1),
         )
         logs = found.x
@@ -157,3 +159,25 @@ def identify_dynamics(measurement: Measurement, drive: ArrayLike) -> DynamicsMod
     confidence = intervals(values, fitted, jacobian, residual)
     gain, offset, slope = x.tolist()
     return DynamicsModel(frequency, damping, gain, offset, slope, delay, confidence)
+
+
+def need_vibration(measurement: Measurement, drive: ArrayLike, model: DynamicsModel) -> None:
+    """Raise MeasurementError where a resonance is not seen, as in slow loops, whose width it takes for damping.
+
+    Within half an octave of the natural frequency, the model has to explain what was measured.
+    """
+    modelled = model.deflection(measurement.time, drive)
+    frequency = np.fft.rfftfreq(modelled.size - 1, measurement.sample_time)
+    ratio = frequency / (model.natural_frequency / (2.0 * math.pi))
+    around = np.abs(ratio - 1.0) <= max(np.sqrt(2.0) - 1.0, 2.0 * ratio[1])
+
+    def rms(values: NDArray) -> float:
+        return float(np.linalg.norm(np.fft.rfft(np.diff(values))[around]))
+
+    left = rms(measurement.deflection - modelled) / rms(measurement.deflection)
+    if left > LARGEST_LEFT:
+        raise MeasurementError(
+            f"{measurement.source}: the fit has its resonance at {model.natural_frequency / (2.0 * math.pi):.4g} Hz, and "
+            f"leaves {100.0 * left:.0f} % of what was measured around it, must be at most {100.0 * LARGEST_LEFT:g} %: no "
+            "vibration is seen; drive the finger with a step or a sweep"
+        )

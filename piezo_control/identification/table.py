@@ -56,7 +56,7 @@ class Table:
             raise TableError(
                 f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
             )
-        index = self._index(name, quantity, exact=wanted is None)
+        index = self._index(name or quantity, quantity, exact=wanted is None)
         if index is None:
             if wanted is None:
                 return None
@@ -172,6 +172,12 @@ def read_columns(
     if found["time"] is None and sample_time is None:
         raise TableError(f"{path}: no column for 'time' and no sample time given; {has}")
     places = {quantity: place for quantity, place in found.items() if place}
+    of_column = {index: quantity for quantity, (index, _) in places.items()}
+    for quantity, (index, _) in places.items():
+        if of_column[index] != quantity:
+            raise TableError(
+                f"{path}: column '{table.headers[index]}' cannot be both '{quantity}' and '{of_column[index]}'"
+            )
     values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
     if sample_time is not None:
         values["time"] = sample_time * np.arange(len(table.rows))
