@@ -3,6 +3,9 @@
 
 The nodes configure and activate themselves, in any order, unless `autostart:=false` leaves that to a supervisor. Ctrl-C
 brings the voltage to rest before they end.
+
+Record it with `ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`
+and the topics; without the file rosbag2 loses samples (docs/recordings.md).
 """
 
 from launch import LaunchContext, LaunchDescription

@@ -3,6 +3,9 @@
 
 What is not declared here goes to both fingers, as `params:=FILE` or `plant:=none` (finger.launch.py). `rviz:=true`
 shows the gripper, where robot_state_publisher and rviz2 are installed.
+
+Record it with `ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`
+and the topics; without the file rosbag2 loses samples (docs/recordings.md).
 """
 
 from launch import LaunchDescription

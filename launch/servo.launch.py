@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop in real time on a driver, and a recorder if wanted, in one namespace."""
+"""The loop in real time on a driver, and a recorder if wanted, in one namespace.
+
+Record it with `ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`
+and the topics; without the file rosbag2 loses samples (docs/recordings.md).
+"""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument

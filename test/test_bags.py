@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bags as users make them: several references in one, lost samples, late joiners, clocks on the wall."""
 
+import sys
 from dataclasses import fields
 
 import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
+from test_table import COLUMNS, FORMATS
 
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import (
@@ -22,6 +24,7 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 from piezo_sim.experiment.analysis import classify, steps
 from piezo_sim.experiment.bags import analysed, compare_bags
+from piezo_sim.experiment.cli import main
 
 H = 1e-3  # s
 LAG = 0.02  # s, of a finger that follows with a first-order lag: settles to 5 % in 3.0 and to 2 % in 3.9 lags
@@ -199,3 +202,22 @@ def test_tables_are_analysed_as_bags_are(tmp_path):
         BagError, match="session.csv: no column for 'deflection'; the file has Zeit"
     ):
         analysed([table])
+
+
+@pytest.mark.parametrize("path", sorted(FORMATS.iterdir()), ids=lambda path: path.name)
+def test_every_table_that_identify_reads_is_analysed(path):
+    """A finger of 0.5 µm/V between -20 and 20 V, in the shapes of test/data/formats."""
+    (one,) = analysed([path], "hysteresis", columns=COLUMNS.get(path.name)).values()
+    assert one.figures[""]["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
+    assert one.figures[""]["slope_um_per_v"] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_tables_are_analysed_and_compared_on_the_command_line(monkeypatch, tmp_path, capsys):
+    table, other = FORMATS / "savetxt.dat", FORMATS / "bars.txt"
+    for number, words in enumerate(
+        (["analyse", table, "--voltage", "voltage"], ["compare", table, other])
+    ):
+        out = tmp_path / str(number)
+        monkeypatch.setattr(sys, "argv", ["experiment", *map(str, words), "--out", str(out)])
+        assert main() == 0, capsys.readouterr().err
+        assert (out / "report.html").exists()

@@ -6,6 +6,7 @@ import pytest
 
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks
+from piezo_control.identification.dynamics import DynamicsModel
 from piezo_control.identification.measurement import (
     Measurement,
     MeasurementError,
@@ -134,3 +135,23 @@ def test_a_few_missing_rows_are_bridged_by_straight_lines():
     )  # curvature within 15 ms of the sine
     whole.need_even_sampling()
     assert measured().bridged().time is TIME
+
+
+RINGING_TIME = np.arange(800) * 1e-4
+STEP = np.where(RINGING_TIME < 2e-3, 0.0, 40.0)
+RINGING = DynamicsModel(2.0 * np.pi * 300.0, 0.02, 5.5e-7, 0.0, 0.0, 0).deflection(
+    RINGING_TIME, STEP
+)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_vibration_that_stops_at_the_end_of_a_sensor_is_refused(side):
+    """300 Hz, 33 samples in a period: 10 % of the first swing are cut off, 7 samples of it."""
+    noise = np.random.default_rng(1).normal(0.0, 2e-9, RINGING.size)
+    whole = measured(side * RINGING + noise, STEP, RINGING_TIME)
+    checks.clipped(whole)
+    cut = side * np.minimum(RINGING, 0.9 * RINGING.max()) + noise
+    with pytest.raises(
+        MeasurementError, match="a.csv: .*rows .* stay at .*the sensor is at its end"
+    ):
+        checks.clipped(measured(cut, STEP, RINGING_TIME))

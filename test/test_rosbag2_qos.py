@@ -26,6 +26,11 @@ def test_every_topic_that_the_recorder_takes_is_there_in_every_namespace():
     assert set(OVERRIDES) == {f"/{finger}/{topic}" for finger in fingers for topic in FINGER}
 
 
+@pytest.mark.parametrize("launch", sorted((shared_folder() / "launch").glob("*.launch.py")))
+def test_launch_files_say_how_to_record(launch):
+    assert "--qos-profile-overrides-path" in launch.read_text()
+
+
 @pytest.mark.parametrize("topic", OVERRIDES)
 def test_every_field_is_there_and_nothing_is_lost(topic):
     fields = OVERRIDES[topic]

@@ -142,6 +142,24 @@ def _voltmeter_at_its_end(measurement: Measurement, side: float) -> None:
             )
 
 
+def clipped(measurement: Measurement) -> None:
+    """Raise MeasurementError for a vibration that stops at an end and stays there, as at the end of a sensor."""
+    for side in (1.0, -1.0):
+        deflection = side * measurement.deflection
+        stroke = float(np.ptp(deflection))
+        for run in _runs(deflection >= deflection.max() - AT_THE_END * stroke):
+            if run.start == 0 or run.stop == deflection.size:
+                continue
+            inside = deflection[run]
+            steps = inside[0] - deflection[run.start - 1], inside[-1] - deflection[run.stop]
+            if min(steps) > 4.0 * AT_THE_END * stroke:
+                raise _refuse(
+                    measurement,
+                    f"column 'deflection', {_rows(measurement, run)} stay at {side * inside.mean():.4g} m between steps "
+                    f"of {min(steps) * 1e6:.3g} µm: the sensor is at its end, or something is in the way; drive less",
+                )
+
+
 def _drift(measurement: Measurement) -> None:
     """Compare the loop's centre from cycle to cycle with the loop's width, at the middle of the voltage."""
     passages = _crossings(measurement)

@@ -209,6 +209,7 @@ def finish_dynamics(
     console: Console,
 ) -> list[Path]:
     """Fit, show and store the response to `drive`, which has to explain more than `less` of it does."""
+    checks.clipped(measurement)
     model = identify_dynamics(measurement, drive)
     if model.gain < 0.0:
         what = "voltage" if less else "tip_force"

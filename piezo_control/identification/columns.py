@@ -26,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser, quantities: Mapping[str, tuple[
     )
     for quantity, units in quantities.items():
         group.add_argument(
-            f"--{quantity.replace('_', '-')}", metavar="COLUMN[:UNIT]",
+            f"--{quantity.replace('_', '-')}", dest=f"column_{quantity}", metavar="COLUMN[:UNIT]",
             help=f"column of the {quantity.replace('_', ' ')}; units {', '.join(units)}",
         )  # fmt: skip
     group.add_argument(
@@ -51,5 +51,6 @@ def chosen_columns(
     arguments: argparse.Namespace, quantities: Mapping[str, tuple[str, ...]]
 ) -> tuple[dict[str, str], float | None]:
     """Return the columns and the time between rows (s) that a command line names."""
-    named = {q: getattr(arguments, q) for q in quantities if getattr(arguments, q)}
+    given = {quantity: getattr(arguments, f"column_{quantity}") for quantity in quantities}
+    named = {quantity: column for quantity, column in given.items() if column}
     return named, 1.0 / arguments.sample_rate if arguments.sample_rate else None

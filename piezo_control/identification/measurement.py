@@ -99,7 +99,10 @@ class Measurement:
         if len(uneven):
             i = uneven[0]
             raise self.error(
-                "time", i + 1, f"{steps[i]:g} s after the row before, must be {self.sample_time:g}"
+                "time",
+                i + 1,
+                f"{steps[i]:g} s after the row before, must be {self.sample_time:g}; where the instrument samples "
+                f"evenly, --sample-rate {1.0 / self.sample_time:.5g} takes the place of its clock",
             )
 
     def clock(self) -> list[str]:
