@@ -99,6 +99,8 @@ def _separator(line: str) -> str:
 def _split(line: str, separator: str) -> list[str]:
     if separator == " ":
         line = line.replace("\t", " ").strip()
+    if '"' not in line:  # much faster
+        return line.split() if separator == " " else [c.strip() for c in line.split(separator)]
     (cells,) = csv.reader([line], delimiter=separator, skipinitialspace=True)
     return [cell.strip() for cell in cells]
 

@@ -110,11 +110,14 @@ class Table:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
-        text = column.str.strip()
-        plain = with_points(text, self.decimal)
-        values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
+        text = plain = column
+        written = (text != "").to_numpy()
+        values = pd.to_numeric(text, errors="coerce").to_numpy(float)
+        if np.any(np.isnan(values) & written):
+            plain = with_points(text, self.decimal)
+            values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
         # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
-        unread = np.isnan(values) & (text != "").to_numpy()
+        unread = np.isnan(values) & written
         if unread.size and unread.all():
             dates = pd.to_datetime(plain, errors="coerce", format="mixed")
             if dates.notna().all():
@@ -278,5 +281,5 @@ def _read_sheet(path: Path) -> Table:
         raise TableError(f"{path}: cannot be read: {absent('openpyxl')}") from None
     except Exception as error:  # of the library that takes the bytes apart, whatever they are
         raise TableError(f"{path}: cannot be read: {error}") from None
-    rows = [Row(n + 1, cells) for n, *cells in cells.fillna("").itertuples()]
+    rows = [Row(n + 1, [c.strip() for c in cells]) for n, *cells in cells.fillna("").itertuples()]
     return _table(path, rows, "of the first sheet")
