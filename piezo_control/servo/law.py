@@ -154,7 +154,7 @@ class Feeling(NamedTuple):
     models_state: SensorlessState
     touch: TouchCoefficients
     touch_state: TouchState
-    expected: np.ndarray  # m, the next reading if nobody pushes
+    expected: np.ndarray  # m, this reading if nobody pushes
     temperature: np.ndarray  # °C, NaN: none is known
     is_settled: np.ndarray  # 0 before the first temperature
     max_force: np.ndarray  # N
@@ -338,31 +338,15 @@ def servo_step(
     reference: float,
     share: float,
 ) -> float:
-    """Return the voltage (V) of one sample, which the models of a finger that feels follow.
+    """Return the voltage (V) of one sample; the models of a finger that feels follow the one before.
 
     `wanted` is the controller to use (0 or 1), `status` and `raw` what the card returned and read, `age` the
     age of that (s), `reference` in m. `share` (0 to 1) is the part of a sample time from the last voltage to
     this one at the actuator, so that the slew limit holds in time.
     """
-    voltage = answer(c, laws, w, wanted, status, raw, age, reference, share)
-    if c.feels:
-        expect(laws.feeling, voltage)
-    return voltage
-
-
-def answer(
-    c: Settings,
-    laws: Laws,
-    w: Watch,
-    wanted: int,
-    status: int,
-    raw: float,
-    age: float,
-    reference: float,
-    share: float,
-) -> float:
-    """Return the voltage (V) of one sample; arguments as of :func:`servo_step`."""
     last = laws.feedforward_state.hysteresis.voltage[0]
+    if c.feels:
+        expect(laws.feeling, last)
     if status == FAILED:
         trip(w, DEVICE, 0.0)
     elif status == FRESH:
@@ -401,7 +385,7 @@ def touch(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float
 
 
 def expect(f: Feeling, voltage: float) -> None:
-    """Let the models follow the voltage (V), and keep what they expect of the next reading."""
+    """Let the models follow the voltage (V) that led to this reading, and keep what they expect of it."""
     degc = f.temperature[0]
     if f.is_settled[0] == 0.0 and degc == degc:  # not NaN
         settle(f.models, f.models_state, degc)
