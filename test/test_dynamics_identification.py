@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piezo_control.dynamics import ModesParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.dynamics import (
     DynamicsModel,
@@ -24,12 +25,13 @@ from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 SAMPLE_TIME = 1e-4
 # D(s) of the paper: 5.7e-8 s^2 + 8.1e-6 s + 1
 FREQUENCY = 1.0 / math.sqrt(5.7e-8)
+NONE = ModesParameters()
 DAMPING = 8.1e-6 / (2.0 * math.sqrt(5.7e-8))
 
 
-def measured(voltage, tip_force):
+def measured(voltage, tip_force, modes=NONE):
     """The default finger: 10 nm steps, 5 nm noise, one sample of delay, creep."""
-    plant = Cantilever(CantileverParameters(sample_time=SAMPLE_TIME))
+    plant = Cantilever(CantileverParameters(sample_time=SAMPLE_TIME, modes=modes))
     deflection = []
     for v, force in zip(voltage.tolist(), tip_force.tolist()):
         deflection.append(plant.measure())
@@ -140,3 +142,28 @@ def test_the_width_of_slow_loops_is_not_taken_for_damping():
         MeasurementError, match="no vibration is seen; drive the finger with a step"
     ):
         need_vibration(measurement, measurement.voltage, model)
+
+
+@pytest.mark.parametrize(
+    "modes",
+    [
+        NONE,
+        ModesParameters((4178.0,), (0.017,), (0.08,)),  # the textbook's second bending mode
+        ModesParameters((2500.0,), (0.01,), (-0.03,)),
+        ModesParameters((2200.0, 4000.0), (0.017, 0.01), (0.05, -0.03)),
+    ],
+    ids=["none", "textbook", "opposite", "two"],
+)
+def test_as_many_modes_are_found_as_there_are(modes):
+    measurement = measured(step(40.0, 800), np.zeros(800), modes)
+    model = identify_dynamics(measurement, measurement.voltage, most_modes=5)
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=1e-4)
+    assert model.damping_ratio == pytest.approx(DAMPING, rel=0.01)
+    assert len(model.modes) == len(modes.share)
+    for found, *expected in zip(model.modes, modes.frequency_hz, modes.damping, modes.share):
+        frequency, damping, share = expected
+        assert found.natural_frequency == pytest.approx(2.0 * np.pi * frequency, rel=1e-4)
+        assert found.damping_ratio == pytest.approx(damping, rel=0.02)
+        assert found.share == pytest.approx(share, rel=0.01)
+    left = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
+    assert np.sqrt(np.mean(left**2)) < 8e-9  # noise of 5 nm, steps of 10 nm: 5.8 nm

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from piezo_control.creep import CreepParameters
+from piezo_control.dynamics import ModesParameters
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
@@ -141,6 +142,18 @@ def test_every_step_ends_in_one_cantilever_file(identify, tmp_path):
         assert (out / picture).stat().st_size > 10_000
 
 
+def test_higher_modes_are_written_and_taken_back(identify, tmp_path):
+    modes = ModesParameters((4178.0,), (0.017,), (0.08,))
+    for number, plant in enumerate((CantileverParameters(modes=modes), CantileverParameters())):
+        step = Profile([0.0, 2e-3], [0.0, 40.0])
+        assert identify("dynamics", recorded(tmp_path / str(number), plant, step, 0.08)) == 0
+        path = tmp_path / "identified" / "cantilever.yaml"
+        found = build(CantileverParameters, load(path, "cantilever"), str(path)).modes
+        for name in ("frequency_hz", "damping", "share"):
+            assert getattr(found, name) == pytest.approx(getattr(plant.modes, name), rel=0.02)
+    assert "modes:" not in path.read_text()
+
+
 def test_creep_and_heat_from_two_bags(identify, tmp_path):
     plant = CantileverParameters(sample_time=2e-2)
     step = Profile([0.0, 1.0], [0.0, 40.0])
@@ -218,7 +231,7 @@ def table(path, voltage, deflection, force=None, temperature=None, rate=200.0):
         # A finger that answers at once, and its sensor's slow error: nothing vibrates.
         ("dynamics", "vibration", (LOOP, 0.5 * LOOP + 2.0 * np.sin(np.arange(2000) / 150.0))),
         # A force that does nothing, and a knock at the table.
-        ("stiffness", "no force", (0.0 * LOOP, 5.0 * (np.arange(2000) // 8 == 78), LOOP > 0.0)),
+        ("stiffness", "no force", (0.0 * LOOP, 5.0 * np.exp(-(((np.arange(2000) - 628) / 4.0) ** 2)), LOOP > 0.0)),
         # A deflection that neither creep nor heat explains.
         (
             "drift",

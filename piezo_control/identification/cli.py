@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from piezo_control.creep import CreepParameters
-from piezo_control.dynamics import DynamicsParameters
+from piezo_control.dynamics import DynamicsParameters, ModesParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
@@ -50,6 +50,7 @@ from piezo_control.thermal import ThermalParameters
 GROUPS = {
     "hysteresis": HysteresisParameters,
     "dynamics": DynamicsParameters,
+    "modes": ModesParameters,
     "creep": CreepParameters,
     "thermal": ThermalParameters,
 }
@@ -134,7 +135,9 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         {**found, "offset": model.offset, "lag": model.lag},
         model.confidence,
     )
-    written = update_cantilever(arguments.out, "hysteresis", comment, flatten(model.parameters))
+    written = update_cantilever(
+        arguments.out, "hysteresis", comment, {"hysteresis": flatten(model.parameters)}
+    )
     dump(
         path,
         "feedforward",
@@ -210,7 +213,7 @@ def finish_dynamics(
 ) -> list[Path]:
     """Fit, show and store the response to `drive`, which has to explain more than `less` of it does."""
     checks.clipped(measurement)
-    model = identify_dynamics(measurement, drive)
+    model = identify_dynamics(measurement, drive, arguments.modes if less else 1)
     if model.gain < 0.0:
         what = "voltage" if less else "tip_force"
         raise checks.reversed_sensor(measurement, f"gain {model.gain:.3g}", what)
@@ -232,12 +235,25 @@ def finish_dynamics(
         "denominator": model.denominator,
         "gain": model.gain,
     }
-    change: dict[str, Any] = {"denominator": model.denominator}
     confidence = dict(model.confidence)
-    if name == "stiffness":
-        change = {"elastic_constant": found.pop("gain")}
+    groups: dict[str, dict[str, Any]]
+    if less:
+        frequencies, damping, shares = zip(*model.modes) if model.modes else ((), (), ())
+        modes = {
+            "frequency_hz": tuple(w / (2.0 * np.pi) for w in frequencies),
+            "damping": damping,
+            "share": shares,
+        }
+        groups = {
+            "dynamics": {"denominator": model.denominator},
+            "modes": modes,
+            "sensor": {"delay_samples": found["delay_samples"]},
+        }
+        found.update({f"modes.{key}": value for key, value in modes.items() if value})
+    else:
+        groups = {"dynamics": {"elastic_constant": found.pop("gain")}}
         confidence["elastic_constant"] = confidence.pop("gain")
-    found.update(change)
+        found.update(groups["dynamics"])
     for line in lines(found, confidence):
         console.print(line, soft_wrap=True)
     console.print(f"delay_samples: {found['delay_samples']}")
@@ -247,11 +263,7 @@ def finish_dynamics(
         found,
         confidence,
     )
-    written = update_cantilever(arguments.out, name, comment, change, "dynamics")
-    if name != "stiffness":
-        update_cantilever(
-            arguments.out, name, comment, {"delay_samples": found["delay_samples"]}, "sensor"
-        )
+    written = update_cantilever(arguments.out, name, comment, groups)
     picture = arguments.out / f"{name}.png"
     curve = np.column_stack((measurement.time, measurement.deflection, modelled))
     plots.responses([(measurement.source, curve)], lines(found, confidence), picture)
@@ -301,12 +313,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     if model.time_constant > 0.0:
         groups["thermal"] = {"sensitivity": model.sensitivity, "time_constant": model.time_constant}
     comment = said("drift", f"identified from {names}", found, model.confidence)
-    for name, values in groups.items():
-        build(GROUPS[name], values, f"{names}: {name}")
-    written = [
-        update_cantilever(arguments.out, "drift", comment, values, name)
-        for name, values in groups.items()
-    ]
+    written = [update_cantilever(arguments.out, "drift", comment, groups)] if groups else []
     picture = arguments.out / "drift.png"
     plots.responses(
         list(zip(map(str, arguments.recording), model.fitted)),
@@ -314,7 +321,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
         picture,
     )
     return [
-        *dict.fromkeys(written),
+        *written,
         picture,
         write_json(
             arguments.out / "drift.json",
@@ -363,21 +370,23 @@ def said(name: str, source: str, found: Values, confidence: Values) -> str:
 
 
 def update_cantilever(
-    out: Path, name: str, comment: str, found: Mapping[str, Any], group: str = ""
+    out: Path, name: str, comment: str, groups: Mapping[str, Mapping[str, Any]]
 ) -> Path:
-    """Put values of a `group` that the identification `name` found into cantilever.yaml, keeping all else.
+    """Put the values by group that the identification `name` found into cantilever.yaml, keeping all else.
 
     Raises ParameterError, and writes nothing, if the node would refuse them.
     """
-    path, group = out / "cantilever.yaml", group or name
-    if group in GROUPS:
-        build(GROUPS[group], found, f"identified {group}")
+    path = out / "cantilever.yaml"
+    for group, found in groups.items():
+        if group in GROUPS:
+            build(GROUPS[group], found, f"identified {group}")
     values, comments = {}, []
     if path.exists():
         values = load(path, "cantilever")
         comments = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
         comments = [line for line in comments if not line.startswith(f"{name}: ")]
-    values.update({f"{group}.{entry}": value for entry, value in found.items()})
+    for group, found in groups.items():
+        values.update({f"{group}.{entry}": value for entry, value in found.items()})
     dump(path, "cantilever", values, "\n".join([*comments, comment]))
     return path
 
@@ -504,7 +513,10 @@ def parse() -> argparse.Namespace:
         help="of the samples (0.3)",
     )
     command(check).add_argument("--skip", type=within(int, 0), metavar="SAMPLES", help="not judged")
-    command(dynamics)
+    command(dynamics).add_argument(
+        "--modes", type=within(int, 1, 6), default=3, metavar="N",
+        help="so many at most (3); those are kept that the recording is evidence for",
+    )  # fmt: skip
     command(stiffness)
     command(drift, several=True)
     return parser.parse_args()
