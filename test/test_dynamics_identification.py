@@ -167,3 +167,13 @@ def test_as_many_modes_are_found_as_there_are(modes):
         assert found.share == pytest.approx(share, rel=0.01)
     left = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
     assert np.sqrt(np.mean(left**2)) < 8e-9  # noise of 5 nm, steps of 10 nm: 5.8 nm
+
+
+def test_creep_is_taken_for_no_mode():
+    """Logarithmic creep of 4 % of the deflection in 80 ms, as no straight line says it."""
+    measurement = measured(step(40.0, 800), np.zeros(800))
+    since = np.maximum(measurement.time - 2e-3, 0.0)
+    crept = measurement.deflection + 0.2e-6 * np.log1p(since / 1e-3)
+    model = identify_dynamics(replace(measurement, deflection=crept), measurement.voltage, 5)
+    assert model.modes == ()
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=1e-3)

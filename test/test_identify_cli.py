@@ -93,7 +93,7 @@ def test_the_same_chain_from_a_spreadsheet(identify, monkeypatch, tmp_path):
     quick = CantileverParameters(plant="truth")
     words = ("--time", "Zeit", "--voltage", "Spannung", "--deflection", "Auslenkung")
     excited = drive(slow, CONSTANT, decaying_sine(40.0, cycles=20), 20_000)
-    stepped = drive(quick, CONSTANT, Profile([0.0, 2e-3], [0.0, 40.0]), 800)
+    stepped = drive(quick, CONSTANT, Profile([0.0, 2e-3], [0.0, 40.0]), 800)  # with 0.2 % of creep
     assert identify("hysteresis", spreadsheet(tmp_path / "excite.csv", excited), *words) == 0
     assert identify("dynamics", spreadsheet(tmp_path / "step.csv", stepped), *words) == 0
     out = tmp_path / "identified"

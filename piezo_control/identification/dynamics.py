@@ -37,6 +37,7 @@ STEP = 1e-6  # relative, of a derivative
 DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
 LIGHT_DAMPING = (0.005, 0.03, 0.2)  # of higher modes
 NUMBERS_PER_MODE = 3
+HIGHER = 1.2  # times the first natural frequency: lower ones would take creep for a vibration
 
 
 class Mode(NamedTuple):
@@ -172,8 +173,9 @@ class _Problem:
     def begun(
         self, modes: list[tuple[float, float]], damping: Sequence[float], delay: int
     ) -> list[tuple[float, float]]:
-        """Return the modes with the best one of a grid beside them."""
-        grid = np.geomspace(self.lowest, 0.98 * self.nyquist, FREQUENCIES)
+        """Return the modes with the best one of a grid beside them, above the first."""
+        lowest = HIGHER * modes[0][0] if modes else self.lowest
+        grid = np.geomspace(lowest, max(lowest, 0.98 * self.nyquist), FREQUENCIES)
         trials = [[*modes, (w, d)] for w in grid.tolist() for d in damping]
         return min(trials, key=lambda trial: float(np.sum(self.linear(trial, delay)[1] ** 2)))
 
@@ -195,12 +197,17 @@ class _Problem:
         return _Fit(pairs, delay, 2.0 * found.cost * spread**2)
 
     def is_evidence(self, fewer: _Fit, more: _Fit) -> bool:
-        """Tell whether a measurement is evidence for one mode more, one that vibrates."""
+        """Tell whether a measurement is evidence for one mode more, one that vibrates, above the first."""
         left = self.linear(more.modes, more.delay)[1]
         samples = left.size / memory(left)
         gained = samples * math.log(fewer.squares / more.squares) if more.squares > 0.0 else 0.0
-        vibrates = all(d < 1.0 and w < self.nyquist for w, d in more.modes)
-        return vibrates and gained > NUMBERS_PER_MODE * math.log(samples)
+        first = more.modes[0][0] / fewer.modes[0][0]
+        higher = all(d < 1.0 and w < self.nyquist for w, d in more.modes[1:])
+        return (
+            higher
+            and 1.0 / HIGHER < first < HIGHER
+            and gained > NUMBERS_PER_MODE * math.log(samples)
+        )
 
     def model(self, fit: _Fit) -> DynamicsModel:
         """Return the model with its intervals."""
