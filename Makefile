@@ -33,7 +33,7 @@ figures: paper
 	$(RUN) python docs/figures.py out/paper
 
 sensorless: env
-	$(RUN) python -m piezo_sim.experiment.sensorless --out out/sensorless
+	$(RUN) python -m piezo_sim.experiment.sensorless --out out/sensorless --overwrite
 
 grasp: env
 	$(RUN) python -m piezo_sim.experiment.on_nodes.grasp --out out/grasp --overwrite

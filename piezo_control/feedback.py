@@ -71,6 +71,11 @@ class FeedbackParameters:
     anti_windup: tuple[float, ...] = parameter(
         (), "input of (limited - unlimited command) to the states", unit="1/m"
     )
+    preview_band: float = parameter(
+        0.0,
+        "profiles and waveforms, known ahead, are followed without lag below this frequency; 0: as they come. "
+        "Of `feedback` and the engine, not of the servo", unit="Hz", low=0.0, high=1e5,
+    )  # fmt: skip
 
     def __post_init__(self) -> None:
         if not self.command_low < self.command_high:

@@ -19,8 +19,9 @@ part within the sample, so for a finger that is its model nothing is left but th
 leaves. Where a limit acts, the models follow the voltage applied.
 
 While a controller leads the finger, its commands go through the inverse hysteresis of the same plays, and
-creep and heat follow. From one to the other the voltage has no bump: what models and controller disagree on
-at that moment is added to the input from then on.
+creep and heat follow; gain and offset of the models may slowly follow the sensor
+(:mod:`piezo_control.adaptation`), for when it is taken away. From one to the other the voltage has no bump:
+what models and controller disagree on at that moment is added to the input from then on.
 
 Source: M. Rakotondrabe, C. Clévy, P. Lutz, *Complete open loop control of hysteretic, creeped, and
 oscillating piezoelectric cantilevers*, IEEE T-ASE 7 (2010) 440, for the structure; the inverse that follows
@@ -37,7 +38,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from piezo_control import creep, shaping, thermal
+from piezo_control import adaptation, creep, shaping, thermal
+from piezo_control.adaptation import (
+    Adaptation,
+    AdaptationParameters,
+    AdaptationState,
+    adapt,
+    remember,
+    unadapted,
+)
 from piezo_control.creep import Creep, CreepParameters, creep_step
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.hysteresis import (
@@ -85,6 +94,7 @@ class SensorlessParameters(VoltageParameters):
     creep: CreepParameters = group(CreepParameters)
     thermal: ThermalParameters = group(ThermalParameters)
     shaping: ShapingParameters = group(ShapingParameters)
+    adaptation: AdaptationParameters = group(AdaptationParameters)
 
 
 class SensorlessCoefficients(NamedTuple):
@@ -100,6 +110,7 @@ class SensorlessCoefficients(NamedTuple):
     coldest: float  # °C
     warmest: float  # °C
     rest: float  # V
+    adaptation: Adaptation
 
 
 class SensorlessState(NamedTuple):
@@ -111,6 +122,7 @@ class SensorlessState(NamedTuple):
     past: list[float]  # references (m), newest first
     offset: list[float]  # m, added to the input since a hand-over
     clipped: list[float]  # number of samples at which a limit acted
+    adapted: AdaptationState
 
 
 def sensorless_coefficients(
@@ -155,22 +167,24 @@ def sensorless_coefficients(
         coldest=p.temperature_low,
         warmest=p.temperature_high,
         rest=p.rest,
+        adaptation=adaptation.discretize(p.adaptation, sample_time),
     )
 
 
 def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> SensorlessState:
     """Return the state of a homed finger at its rest voltage, in equilibrium with `temperature_degc`."""
     start = min(max(temperature_degc, c.coldest), c.warmest)
-    state = SensorlessState(
-        hysteresis=State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0]),
+    hysteresis = State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0])
+    home = operator_step(c.operator, hysteresis, c.rest)
+    return SensorlessState(
+        hysteresis=hysteresis,
         relaxations=[0.0] * len(c.creep.retained),
         body=Body([start], degc_at_start=[start]),
-        past=[0.0] * len(c.taps),
+        past=[home] * len(c.taps),
         offset=[0.0],
         clipped=[0.0],
+        adapted=unadapted(c.adaptation, home),
     )
-    state.past[:] = [operator_step(c.operator, state.hysteresis, c.rest)] * len(c.taps)
-    return state
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
@@ -199,10 +213,11 @@ def sensorless_step(
     stroke = 1.0 + c.thermal.gain_per_degc * warmth
     softening = c.thermal.lag_per_degc * warmth
     released *= max(0.0, c.creep.gain + c.creep.gain_per_degc * warmth)
+    rest = wanted - thermal_deflection(c.thermal, s.body) - s.adapted.offset[0]
     ideal = operator_inverse(
         c.operator,
         s.hysteresis,
-        wanted - thermal_deflection(c.thermal, s.body) - left,
+        rest / s.adapted.gain[0] - left,
         stroke * (1.0 + softening),
         released - stroke * softening * c.thermal.slope,
     )
@@ -236,9 +251,25 @@ def apply(
     voltage = limited(c.low, c.high, c.step_limit * share, s.hysteresis.voltage[0], ideal)
     if voltage != ideal:
         s.clipped[0] += 1.0
+    note(c, s, voltage, warmth)
+    return voltage
+
+
+def note(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> None:
+    """Let hysteresis, creep and what will be compared with a reading follow a `voltage` (V)."""
     operator_step(c.operator, s.hysteresis, voltage)
     creep_step(c.creep, s.relaxations, voltage, warmth)
-    return voltage
+    if c.adaptation.rate > 0.0:
+        heat = thermal_deflection(c.thermal, s.body)
+        remember(s.adapted, actuated(c, s, voltage, warmth), heat)
+
+
+def actuated(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
+    """Return what hysteresis and creep (m) are expected to give at the end of a sample at `voltage` (V)."""
+    total = heated(c.thermal, static(c, s), voltage, warmth)
+    for i in range(len(s.relaxations)):
+        total += s.relaxations[i]
+    return total
 
 
 def follow_step(
@@ -247,8 +278,7 @@ def follow_step(
     """Let the models follow a `voltage` (V) that somebody else chose; return what they expect (m) at its end."""
     warmth = s.body.degc[0] - REFERENCE_DEGC
     heat(c, s, temperature_degc)
-    operator_step(c.operator, s.hysteresis, voltage)
-    creep_step(c.creep, s.relaxations, voltage, warmth)
+    note(c, s, voltage, warmth)
     return expected(c, s, voltage, warmth)
 
 
@@ -260,10 +290,15 @@ def settle(c: SensorlessCoefficients, s: SensorlessState, temperature_degc: floa
 
 def expected(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
     """Return the static deflection (m) that the models expect at the end of a sample at `voltage` (V)."""
-    total = thermal_deflection(c.thermal, s.body)
-    for i in range(len(s.relaxations)):
-        total += s.relaxations[i]
-    return heated(c.thermal, static(c, s), voltage, warmth) + total
+    of_voltage = s.adapted.gain[0] * actuated(c, s, voltage, warmth)
+    return of_voltage + thermal_deflection(c.thermal, s.body) + s.adapted.offset[0]
+
+
+def take_over(s: SensorlessState, predicted: float, reference: float) -> None:
+    """Go on without a bump from a controller, by references (m), at the deflection that is `predicted` (m)."""
+    for i in range(len(s.past)):
+        s.past[i] = reference
+    s.offset[0] = predicted - reference
 
 
 def static(c: SensorlessCoefficients, s: SensorlessState) -> float:
@@ -307,21 +342,29 @@ class Sensorless:
         self._check("reference", reference, temperature_degc)
         s = self.state
         if self._led == BY_CONTROLLER:
-            s.past[:] = [reference] * len(s.past)
-            s.offset[0] = self.predicted - reference
+            take_over(s, self.predicted, reference)
         self._led = BY_REFERENCE
         warmth = s.body.degc[0] - REFERENCE_DEGC
         voltage = sensorless_step(self.coefficients, s, reference, temperature_degc, share)
         self._predict(voltage, warmth)
         return voltage
 
-    def lead(self, command: float, temperature_degc: float, share: float = 1.0) -> float:
+    def lead(
+        self,
+        command: float,
+        temperature_degc: float,
+        share: float = 1.0,
+        deflection: float = math.nan,
+    ) -> float:
         """Return the voltage (V) for the command (m) of a controller, through the inverse hysteresis.
 
-        After references of :meth:`step` it goes on from the voltage that is applied. Otherwise as there.
+        After references of :meth:`step` it goes on from the voltage that is applied. To the `deflection` (m)
+        that the sensor reads at this sample gain and offset are adapted, unless it is NaN. Otherwise as there.
         """
         self._check("command", command, temperature_degc)
         s = self.state
+        if not math.isnan(deflection):
+            adapt(self.coefficients.adaptation, s.adapted, deflection)
         if self._led == BY_REFERENCE:
             s.offset[0] = static(self.coefficients, s) - command
         self._led = BY_CONTROLLER

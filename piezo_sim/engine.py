@@ -19,8 +19,10 @@ import numpy as np
 
 from piezo_control import feedback as feedback_law
 from piezo_control import feedforward as feedforward_law
+from piezo_control.adaptation import adapt
 from piezo_control.compiled import as_arrays, has_numba
 from piezo_control.compiled import compiled as compile_loop
+from piezo_control.design.preview import asked
 from piezo_control.feedback import (
     FeedbackCoefficients,
     FeedbackParameters,
@@ -34,7 +36,7 @@ from piezo_control.feedforward import (
     feedforward_step,
 )
 from piezo_control.parameters import ParameterError
-from piezo_control.profile import Profile
+from piezo_control.profile import Profile, Signal
 from piezo_control.recording.recording import Recording
 from piezo_control.safety import VoltageParameters
 from piezo_control.sensorless import (
@@ -46,6 +48,7 @@ from piezo_control.sensorless import (
     sensorless_coefficients,
     sensorless_rest,
     sensorless_step,
+    take_over,
 )
 from piezo_control.sequence import grid_index
 from piezo_control.thermal import REFERENCE_DEGC
@@ -132,6 +135,19 @@ class TouchingFinger(NamedTuple):
     push: np.ndarray  # N, as estimated
 
 
+class LedFinger(NamedTuple):
+    """Laws and plant of a finger that a controller leads as long as there is a sensor."""
+
+    feedback: FeedbackCoefficients
+    feedback_state: FeedbackState
+    models: SensorlessCoefficients
+    models_state: SensorlessState
+    expected: np.ndarray  # m, of the next reading: one number
+    plant: CantileverModel
+    plant_state: CantileverState
+    led: int  # samples with a sensor
+
+
 class Finger(NamedTuple):
     """Coefficients and states of all the laws of one finger."""
 
@@ -159,7 +175,7 @@ def run(
     Parameters
     ----------
     plant, feedforward, feedback, temperatures : parameter dataclasses
-        ``controller: none`` in `feedback` opens the loop.
+        ``controller: none`` in `feedback` opens the loop; with `preview_band` the reference is known ahead.
     reference, tip_force : Profile
         In m and N; no tip force means none from outside.
     compiled : bool, optional
@@ -181,12 +197,13 @@ def run(
         clipped,
         plant,
         temperatures,
-        reference,
+        asked(reference, feedback),
         samples,
         tip_force,
         every,
         compiled,
     )
+    made = replace(made, reference=reference.at(made.time))
     at_end = (made.command <= feedback.command_low) | (made.command >= feedback.command_high)
     if feedback.controller == "none":
         at_end &= made.command != made.reference
@@ -265,6 +282,44 @@ def run_touching(
     return got, finger.push
 
 
+def run_led(
+    plant: CantileverParameters,
+    feedback: FeedbackParameters,
+    models: SensorlessParameters,
+    temperatures: TemperatureParameters,
+    reference: Profile,
+    led: int,
+    samples: int,
+    every: int = 1,
+    compiled: bool | None = None,
+) -> tuple[Run, SensorlessState]:
+    """Run a finger led by a controller for `led` samples, then by its models; return it and their state.
+
+    As long as there is a sensor, gain and offset of the models adapt, where their parameters say so. Other
+    parameters as in :func:`run`. Raises ParameterError when the models have no inverse.
+    """
+    degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
+    inverse = sensorless_coefficients(models, plant.sample_time)
+    sampled = cantilever.model(plant)
+    finger = as_arrays(
+        LedFinger(
+            feedback_law.feedback_coefficients(feedback),
+            FeedbackState([0.0] * feedback.order, [0.0] * feedback.order),
+            inverse,
+            sensorless_rest(inverse, degc),
+            np.zeros(1),
+            sampled,
+            cantilever.rest(sampled, plant.sensor.delay_samples, degc),
+            led,
+        )
+    )
+    clipped = finger.models_state.clipped
+    got = _run(
+        run_led_samples, finger, clipped, plant, temperatures, reference, samples, None, every, compiled,
+    )  # fmt: skip
+    return got, finger.models_state
+
+
 def temperatures_of(
     temperatures: TemperatureParameters, sample_time: float, samples: int
 ) -> np.ndarray:
@@ -279,7 +334,7 @@ def _run(
     clipped: np.ndarray,
     plant: CantileverParameters,
     temperatures: TemperatureParameters,
-    reference: Profile,
+    reference: Signal,
     samples: int,
     tip_force: Profile | None,
     every: int,
@@ -354,7 +409,7 @@ def run_deviating(
     """
     count = len(deviations.resonance)
     inputs = Inputs(
-        reference.at(np.arange(samples) * plant.sample_time),
+        asked(reference, feedback).at(np.arange(samples) * plant.sample_time),
         np.full(samples, temperature_degc),
         np.zeros(samples),
         random.standard_normal((count, samples)),
@@ -465,6 +520,24 @@ def run_fingers(
         )
 
 
+def take_down(
+    outputs: Outputs,
+    row: int,
+    command: float,
+    voltage: float,
+    clips: float,
+    plant: CantileverModel,
+    state: CantileverState,
+) -> None:
+    """Write what is known of a sample, before the finger goes on, into a row of `outputs`."""
+    outputs.deflection[row] = state.readings[0]
+    outputs.command[row] = command
+    outputs.voltage[row] = voltage
+    outputs.total_force[row] = state.tip_force[0]
+    outputs.true_deflection[row] = deflection_of(plant, state)
+    outputs.clips[row] = clips
+
+
 def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs: Outputs) -> None:
     """Run the samples of `inputs`, the first one being number `first`."""
     plant = finger.plant
@@ -478,12 +551,9 @@ def run_samples(finger: Finger, inputs: Inputs, first: int, every: int, outputs:
         voltage = feedforward_step(finger.feedforward, finger.feedforward_state, command, 1.0)
         if (first + n) % every == 0:
             row = (first + n) // every
-            outputs.deflection[row] = deflection
-            outputs.command[row] = command
-            outputs.voltage[row] = voltage
-            outputs.total_force[row] = state.tip_force[0]
-            outputs.true_deflection[row] = deflection_of(plant, state)
-            outputs.clips[row] = finger.feedforward_state.clipped[0]
+            take_down(
+                outputs, row, command, voltage, finger.feedforward_state.clipped[0], plant, state
+            )
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 
 
@@ -501,12 +571,7 @@ def run_sensorless_samples(
         )
         if (first + n) % every == 0:
             row = (first + n) // every
-            outputs.deflection[row] = state.readings[0]
-            outputs.command[row] = reference
-            outputs.voltage[row] = voltage
-            outputs.total_force[row] = state.tip_force[0]
-            outputs.true_deflection[row] = deflection_of(plant, state)
-            outputs.clips[row] = finger.law_state.clipped[0]
+            take_down(outputs, row, reference, voltage, finger.law_state.clipped[0], plant, state)
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
 
 
@@ -532,10 +597,35 @@ def run_touching_samples(
         finger.push[first + n] = push_of(law, law_state)
         if (first + n) % every == 0:
             row = (first + n) // every
-            outputs.deflection[row] = deflection
-            outputs.command[row] = command
-            outputs.voltage[row] = voltage
-            outputs.total_force[row] = state.tip_force[0]
-            outputs.true_deflection[row] = deflection_of(plant, state)
-            outputs.clips[row] = models_state.clipped[0]
+            take_down(outputs, row, command, voltage, models_state.clipped[0], plant, state)
         advance(plant, state, voltage, inputs.temperature[n], inputs.tip_force[n])
+
+
+def run_led_samples(
+    finger: LedFinger, inputs: Inputs, first: int, every: int, outputs: Outputs
+) -> None:
+    """Run the samples of `inputs`, with a sensor until that is taken away, the first being number `first`."""
+    models = finger.models
+    models_state = finger.models_state
+    plant = finger.plant
+    state = finger.plant_state
+    for n in range(len(inputs.reference)):
+        look(plant, state, inputs.normal[n], inputs.uniform[n])
+        deflection = state.readings[0]
+        reference = inputs.reference[n]
+        degc = inputs.temperature[n]
+        warmth = models_state.body.degc[0] - REFERENCE_DEGC
+        if first + n < finger.led:
+            command = feedback_step(finger.feedback, finger.feedback_state, reference, deflection)
+            adapt(models.adaptation, models_state.adapted, deflection)
+            voltage = inverse_step(models, models_state, command, degc, 1.0)
+        else:
+            command = reference
+            if first + n == finger.led:
+                take_over(models_state, finger.expected[0], reference)
+            voltage = sensorless_step(models, models_state, reference, degc, 1.0)
+        finger.expected[0] = expected(models, models_state, voltage, warmth)
+        if (first + n) % every == 0:
+            row = (first + n) // every
+            take_down(outputs, row, command, voltage, models_state.clipped[0], plant, state)
+        advance(plant, state, voltage, degc, inputs.tip_force[n])

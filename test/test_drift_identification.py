@@ -6,6 +6,7 @@ import pytest
 
 from piezo_control.hysteresis import HysteresisParameters
 from piezo_control.identification.drift import identify_drift
+from piezo_control.identification.excitation import decaying_sine
 from piezo_control.identification.measurement import Measurement, MeasurementError
 from piezo_control.profile import Profile
 from piezo_sim.engine import drive
@@ -56,6 +57,34 @@ def test_creep_and_thermal_terms_come_back(recordings):
         found = model.creep_after_step(time, 40.0, 22.0 + warmth)
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
     assert sum(model.creep_shares) == pytest.approx(1.0)
+
+
+def test_the_width_of_the_loop_comes_back_from_loops_at_two_temperatures(recordings):
+    """Exactly but for creep within the loop, though the first rise is no part of the fit."""
+    loops = [
+        measured(decaying_sine(40.0, cycles=10, frequency_hz=hertz), constant, 10.0 / hertz)
+        for hertz in (0.2, 1.0)
+        for constant in (
+            TemperatureParameters(base_degc=22.0),
+            TemperatureParameters(base_degc=32.0),
+        )
+    ]
+    model = identify_drift([*recordings, *loops], PLANT.hysteresis)
+    assert model.gain_per_degc == pytest.approx(PLANT.thermal.gain_per_degc, rel=0.02)
+    assert model.lag_per_degc == pytest.approx(PLANT.thermal.lag_per_degc, rel=0.05)
+    # One of them alone says nothing about it.
+    alone = identify_drift([*recordings, loops[1]], PLANT.hysteresis)
+    assert alone.lag_per_degc == pytest.approx(0.0, abs=1e-9)
+
+
+def test_creep_and_heat_are_taken_out_of_a_recording(recordings):
+    model = identify_drift(recordings, PLANT.hysteresis)
+    for recording, begin in (
+        (recordings[1], 200),
+        (recordings[2], 0),
+    ):  # 5 µm of creep, 1.5 µm of heat
+        assert np.ptp(recording.deflection[begin:]) > 1.4e-6
+        assert np.ptp(model.cleared(recording).deflection[begin:]) < 0.2e-6
 
 
 def test_fit_describes_the_recordings(recordings):

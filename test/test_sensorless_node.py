@@ -9,6 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Temperature
 
+from piezo_control.adaptation import AdaptationParameters
 from piezo_control.nodes.qos import SAMPLE
 from piezo_control.parameters import dump
 from piezo_control.sensorless import Sensorless, SensorlessParameters
@@ -27,6 +28,7 @@ class Loop:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.command = self.node.create_publisher(Sample, "command", SAMPLE)
+        self.deflection = self.node.create_publisher(Sample, "deflection", SAMPLE)
         self.temperature = self.node.create_publisher(Temperature, "temperature", SAMPLE)
         self.voltages = {}
         self.said = {}
@@ -104,6 +106,23 @@ def test_each_sample_waits_for_its_temperature_and_a_sensor_may_go_in_mid_run(st
     assert got[-1] > 10.0
     assert abs(loop.voltages[4].value - got[-1]) < 5e-3  # no bump: heat and creep of 0.1 ms
     assert float(loop.said["body temperature"]) > 30.0
+
+
+def test_models_adapt_to_the_deflection_that_each_command_answers(start):
+    parameters = AdaptationParameters(time_constant=0.01)
+    law = Sensorless(SensorlessParameters(adaptation=parameters), H, 22.0)
+    loop = start(**{"adaptation.time_constant": 0.01})
+    loop.wait(lambda: loop.deflection.get_subscription_count() > 0)
+    readings = [0.0, 1e-6, 4e-6, 7e-6]
+    loop.command.publish(Sample(number=0, value=6e-6, by_controller=True))
+    loop.wait(lambda: loop.said.get("") == "sample 0 waits for its deflection")
+    for number, reading in enumerate(readings):
+        loop.deflection.publish(Sample(number=number, value=reading))
+        voltage = loop.ask(number, 6e-6, by_controller=True).value
+        assert voltage == law.lead(6e-6, 22.0, deflection=reading)
+    # The sensor is taken away: the reference itself comes, with no deflection to wait for.
+    assert loop.ask(4, 6e-6).value == law.step(6e-6, 22.0)
+    assert law.state.adapted.gain[0] != 1.0
 
 
 @pytest.mark.parametrize("fallback", ["hold", "fault"])

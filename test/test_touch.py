@@ -72,9 +72,9 @@ def test_both_loops_are_stable_whatever_the_tip_touches(branch):
 
 
 @pytest.fixture(scope="module")
-def models():
+def models(tmp_path_factory):
     """Models of both plants, identified from recordings through their sensors, as on a bench."""
-    return {plant: identified(CantileverParameters(plant=plant)) for plant in MODEL_ERROR}
+    return {plant: identified(plant, tmp_path_factory.mktemp(plant)) for plant in MODEL_ERROR}
 
 
 def touch_of(plant: str) -> TouchParameters:

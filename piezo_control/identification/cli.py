@@ -2,9 +2,10 @@
 """From recordings of a finger to the parameters its nodes load.
 
 Reads rosbag2 folders and text files, and writes into one folder (--out), step by step:
-feedforward.yaml (`hysteresis`), cantilever.yaml (`hysteresis`, `dynamics`, `stiffness`, `drift`), a
-picture and the fit's figures (JSON) of each step. `check` judges identified parameters on another
-recording.
+feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.yaml (`hysteresis`,
+`dynamics`, `stiffness`, `drift`), a picture and the fit's figures (JSON) of each step. After `hysteresis
+--model classical`, `dynamics` and `drift`, feedforward.yaml has all that `compensator: sensorless` needs.
+`check` judges identified parameters on another recording.
 """
 
 from __future__ import annotations
@@ -13,12 +14,11 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -29,7 +29,7 @@ from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
 from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns, within
 from piezo_control.identification.confidence import Values, lines
-from piezo_control.identification.drift import identify_drift
+from piezo_control.identification.drift import SMALLEST_WARMING, identify_drift, is_loop
 from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics, need_vibration
 from piezo_control.identification.fit import FitQuality, need, quality, straight
 from piezo_control.identification.hysteresis import (
@@ -45,7 +45,8 @@ from piezo_control.identification.measurement import (
     read_measurement,
 )
 from piezo_control.parameters import ParameterError, build, dump, flatten, load
-from piezo_control.thermal import ThermalParameters
+from piezo_control.sensorless import SensorlessParameters
+from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters
 
 GROUPS = {
     "hysteresis": HysteresisParameters,
@@ -55,11 +56,13 @@ GROUPS = {
     "thermal": ThermalParameters,
 }
 """Of the cantilever's parameters, those that are identified."""
+SENSOR_COMMENT = """The deflection shows lag seconds late and with the offset of the sensor; both are no part of the
+operator, and the feedforward does not use them. For `identify check`."""
 
 
-def main() -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code: 0 done, 2 unusable input."""
-    arguments = parse()
+    arguments = parse(words)
     console = Console()
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
@@ -135,27 +138,23 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         {**found, "offset": model.offset, "lag": model.lag},
         model.confidence,
     )
-    written = update_cantilever(
-        arguments.out, "hysteresis", comment, {"hysteresis": flatten(model.parameters)}
-    )
+    operator = {"hysteresis": flatten(model.parameters)}
+    written = update(arguments.out / "cantilever.yaml", "hysteresis", comment, operator)
     dump(
         path,
         "feedforward",
         found,
         f"{comment}\n"
-        "The deflection shows lag seconds late and with the offset of the sensor; both are no part of the\n"
-        "operator, and the feedforward does not use them. The limits of the voltage are\n"
-        "no result of a measurement: they are the defaults until you write what your actuator stands.",
+        "The limits of the voltage are no result of a measurement: they are the defaults until you write what\n"
+        "your actuator stands.",
     )
-    with path.open("a") as file:
-        yaml.safe_dump(
-            {"/**/identification": {"ros__parameters": {"lag": model.lag, "offset": model.offset}}},
-            file,
-        )
+    sensor = arguments.out / "identification.yaml"
+    dump(sensor, "identification", {"lag": model.lag, "offset": model.offset}, SENSOR_COMMENT)
     picture = arguments.out / "hysteresis.png"
     plots.loops(measurement, modelled, fitted, picture, model)
     return [
         path,
+        sensor,
         written,
         *([write_polarity(arguments, console)] if arguments.reversed else []),
         picture,
@@ -170,8 +169,9 @@ def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Judge feedforward.yaml of --out on a recording it was not identified from."""
     measurement = read(arguments.recording, arguments)
     path = arguments.out / "feedforward.yaml"
-    values = load(path, "identification")
-    model = HysteresisModel(stored_hysteresis(path), values["offset"], values["lag"], 0.0)
+    operator = stored_hysteresis(path)
+    sensor = load(arguments.out / "identification.yaml", "identification")
+    model = HysteresisModel(operator, sensor["offset"], sensor["lag"], 0.0)
     samples = slice(arguments.skip or 0, None)
     modelled = model.deflection(measurement.time, measurement.voltage)
     modelled += np.mean((measurement.deflection - modelled)[samples])
@@ -183,7 +183,7 @@ def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
 
 
 def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
-    """Identify D(s) from a step or a sweep of the voltage; update cantilever.yaml."""
+    """Identify D(s) from a step or a sweep of the voltage; update cantilever.yaml and feedforward.yaml."""
     measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("voltage")
     stored = arguments.out / "feedforward.yaml"
@@ -263,12 +263,12 @@ def finish_dynamics(
         found,
         confidence,
     )
-    written = update_cantilever(arguments.out, name, comment, groups)
+    written = store(arguments.out, name, comment, groups)
     picture = arguments.out / f"{name}.png"
     curve = np.column_stack((measurement.time, measurement.deflection, modelled))
     plots.responses([(measurement.source, curve)], lines(found, confidence), picture)
     return [
-        written,
+        *written,
         picture,
         write_json(
             arguments.out / f"{name}.json", {**found, "confidence": confidence, **figures(fit)}
@@ -282,16 +282,18 @@ def delay_of(model: DynamicsModel, arguments: argparse.Namespace) -> int:
 
 
 def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
-    """Identify creep and thermal deflection from long recordings; update cantilever.yaml."""
+    """Identify creep and heat from long recordings; update cantilever.yaml and feedforward.yaml.
+
+    From a loop among them that was recorded at 22 degC the operator is identified once more, without the creep.
+    """
     stored = arguments.out / "feedforward.yaml"
     operator = HysteresisParameters()
     if stored.exists():
         operator = stored_hysteresis(stored)
     else:
         console.print(f"no {stored}: the hysteresis is taken as that of the paper's finger")
-    model = identify_drift(
-        [read(path, arguments).bridged() for path in arguments.recording], operator
-    )
+    measurements = [read(path, arguments).bridged() for path in arguments.recording]
+    model = identify_drift(measurements, operator)
     fits = {
         str(path): quality(curve[:, 1], curve[:, 2], less)
         for path, curve, less in zip(arguments.recording, model.fitted, model.without)
@@ -310,10 +312,21 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
             "times": model.creep_times,
             "shares": model.creep_shares,
         }
-    if model.time_constant > 0.0:
-        groups["thermal"] = {"sensitivity": model.sensitivity, "time_constant": model.time_constant}
+    heat = ["gain_per_degc", "lag_per_degc"]
+    if model.time_constant > 0.0:  # a recording warms up
+        heat += ["sensitivity", "time_constant"]
+    if any(getattr(model, name) for name in heat):
+        groups["thermal"] = {name: getattr(model, name) for name in heat}
     comment = said("drift", f"identified from {names}", found, model.confidence)
-    written = [update_cantilever(arguments.out, "drift", comment, groups)] if groups else []
+    written = store(arguments.out, "drift", comment, groups) if groups else []
+    loop = next(filter(is_cold_loop, measurements), None)
+    if loop and stored.exists():
+        lag = load(arguments.out / "identification.yaml", "identification")["lag"]
+        dead_zones = len(operator.upper_thresholds)
+        fresh = identify_hysteresis(model.cleared(loop), operator.thresholds, dead_zones, lag)
+        comment = f"hysteresis: without this creep, identified once more from {loop.source}"
+        cleared = {"hysteresis": flatten(fresh.parameters)}
+        written += store(arguments.out, "hysteresis", comment, cleared)
     picture = arguments.out / "drift.png"
     plots.responses(
         list(zip(map(str, arguments.recording), model.fitted)),
@@ -332,6 +345,13 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
             },
         ),
     ]
+
+
+def is_cold_loop(measurement: Measurement) -> bool:
+    """Say whether a recording is a loop at the temperature that hysteresis is identified at."""
+    degc = measurement.temperature
+    is_cold = degc is not None and bool(np.all(np.abs(degc - REFERENCE_DEGC) < SMALLEST_WARMING))
+    return is_cold and is_loop(measurement.voltage[settled(measurement) :])
 
 
 def read(path: Path, arguments: argparse.Namespace) -> Measurement:
@@ -356,7 +376,9 @@ def read(path: Path, arguments: argparse.Namespace) -> Measurement:
 
 def stored_hysteresis(path: Path) -> HysteresisParameters:
     """Return the operator in a parameter file of the feedforward node."""
-    return build(FeedforwardParameters, load(path, "feedforward"), str(path)).hysteresis
+    values = load(path, "feedforward")
+    operator = {n: value for n, value in values.items() if n.startswith("hysteresis.")}
+    return build(FeedforwardParameters, operator, str(path)).hysteresis
 
 
 def said(name: str, source: str, found: Values, confidence: Values) -> str:
@@ -369,25 +391,38 @@ def said(name: str, source: str, found: Values, confidence: Values) -> str:
     return "\n".join(f"{name}: {text}" for text in texts)
 
 
-def update_cantilever(
+def store(
     out: Path, name: str, comment: str, groups: Mapping[str, Mapping[str, Any]]
-) -> Path:
-    """Put the values by group that the identification `name` found into cantilever.yaml, keeping all else.
+) -> list[Path]:
+    """Put the values by group that the identification `name` found where they are used; see :func:`update`.
 
-    Raises ParameterError, and writes nothing, if the node would refuse them.
+    That is cantilever.yaml, and feedforward.yaml, where there is one, for the models that it has.
     """
-    path = out / "cantilever.yaml"
+    written = [update(out / "cantilever.yaml", name, comment, groups)]
+    models = {f.name for f in fields(SensorlessParameters)}
+    own = {group: found for group, found in groups.items() if group in models}
+    if own and (out / "feedforward.yaml").exists():
+        written.append(update(out / "feedforward.yaml", name, comment, own))
+    return written
+
+
+def update(path: Path, name: str, comment: str, groups: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Put the values by group that the identification `name` found into a node's file, keeping all else.
+
+    The file has the name of its node. Raises ParameterError, and writes nothing, if the node would refuse
+    them.
+    """
     for group, found in groups.items():
         if group in GROUPS:
             build(GROUPS[group], found, f"identified {group}")
     values, comments = {}, []
     if path.exists():
-        values = load(path, "cantilever")
+        values = load(path, path.stem)
         comments = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
         comments = [line for line in comments if not line.startswith(f"{name}: ")]
     for group, found in groups.items():
         values.update({f"{group}.{entry}": value for entry, value in found.items()})
-    dump(path, "cantilever", values, "\n".join([*comments, comment]))
+    dump(path, path.stem, values, "\n".join([*comments, comment]))
     return path
 
 
@@ -440,7 +475,7 @@ def write_json(path: Path, content: dict) -> Path:
     return path
 
 
-def parse() -> argparse.Namespace:
+def parse(words: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line's arguments."""
     reading = argparse.ArgumentParser(add_help=False)
     add_options(reading, QUANTITIES)
@@ -519,7 +554,7 @@ def parse() -> argparse.Namespace:
     )  # fmt: skip
     command(stiffness)
     command(drift, several=True)
-    return parser.parse_args()
+    return parser.parse_args(words)
 
 
 def seconds(text: str) -> float | str:

@@ -4,18 +4,21 @@
 With the operator's static deflection H(U), the body's temperature theta behind the thermocouple's T,
 and theta_0 the one at the start::
 
-    y = offset + (h + k (theta - 22)) H(U) + s (theta - theta_0) + sum_i c_i
+    y = offset + (h + k (theta - 22)) H(U) - m (theta - 22) (W U - H(U)) + s (theta - theta_0) + sum_i c_i
     time_constant theta' = T - theta
     times_i c_i' = share_i (gain + gain_per_degc (theta - 22)) U - c_i
 
-The time constants and how much of the creep is there at 22 degC are searched; the rest is linear least
-squares with creep of the voltage's sign only. Every recording has its own offset.
+W being the slope of the line that hysteresis lags behind. The lag of the body and how much of the creep is
+there at 22 degC are searched; the rest is linear least squares with creep of the voltage's sign only.
+Relaxation times are on a grid, so that creep of any course is met, logarithmic too. Every recording has its
+own offset. How the width of the loop changes, m, is told by the same loop recorded at two temperatures.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,11 +30,12 @@ from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification.checks import direction
 from piezo_control.identification.confidence import Values, intervals
 from piezo_control.identification.fit import column_norms, straight
+from piezo_control.identification.hysteresis import settled
 from piezo_control.identification.measurement import Measurement, MeasurementError
 from piezo_control.thermal import REFERENCE_DEGC
 
 ROWS = 3000  # per recording, of block means: vibration and noise average out
-RELAXATIONS = 3
+RELAXATIONS = 8  # from block to recording, two or so per decade
 JUMP = 0.1  # of the static range, from block to block: such blocks ring and are not fitted
 SMALLEST_WARMING = 1.0  # degC, to tell what depends on temperature
 
@@ -47,11 +51,26 @@ class DriftModel:
     sensitivity: float  # m/degC
     time_constant: float  # s
     gain_per_degc: float  # 1/degC, of the hysteresis
+    lag_per_degc: float  # 1/degC, of its width
     fitted: tuple[NDArray[np.float64], ...]  # per recording: time (s), measured and modelled (m)
     without: tuple[
         NDArray[np.float64], ...
     ]  # the deflection (m) of a finger without both, at those times
     confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
+
+    def cleared(self, measurement: Measurement) -> Measurement:
+        """Return a recording of a finger that begins at rest, with creep and thermal deflection taken out."""
+        temperature = measurement.temperature
+        if temperature is None:
+            raise MeasurementError(f"{measurement.source}: no column 'temperature'")
+        first, step = float(temperature[0]), measurement.sample_time
+        body = _relax(temperature, self.time_constant, first, step)
+        gain = self.creep_gain + self.creep_gain_per_degc * (body - REFERENCE_DEGC)
+        drive = np.maximum(gain, 0.0) * measurement.voltage
+        drift = self.sensitivity * (body - first)
+        for time, share in zip(self.creep_times, self.creep_shares):
+            drift = drift + share * _relax(drive, time, 0.0, step)
+        return replace(measurement, deflection=measurement.deflection - drift)
 
     def creep_after_step(self, time: NDArray, voltage: float, temperature_degc: float) -> NDArray:
         """Return the creep (m) at `time` (s) after a voltage step (V) at a constant temperature."""
@@ -59,6 +78,17 @@ class DriftModel:
         gain = max(0.0, self.creep_gain + self.creep_gain_per_degc * warmth)
         rise = 1.0 - np.exp(-np.asarray(time)[:, None] / np.array(self.creep_times))
         return gain * voltage * rise @ np.array(self.creep_shares)
+
+
+def _relax(values: NDArray, time_constant: float, start: float, step: float) -> NDArray:
+    """Return `values`, held for `step` (s) each, behind a first-order lag from `start`."""
+    retained = np.exp(-step / time_constant) if time_constant > 0.0 else 0.0
+    return start + lfilter([1.0 - retained], [1.0, -retained], values - start)
+
+
+def is_loop(voltage: NDArray) -> bool:
+    """Say whether a voltage goes from end to end and back."""
+    return bool(np.sum(np.abs(np.diff(voltage))) >= 2.0 * np.ptp(voltage) > 0.0)
 
 
 class _Means:
@@ -82,14 +112,27 @@ class _Means:
         self.deflection = means(measurement.deflection)
         self.voltage = means(measurement.voltage)
         self.static = means(deflection_history(hysteresis, measurement.voltage))
+        self.lag = sum(hysteresis.weights) * self.voltage - self.static
         self.temperature = means(measurement.temperature)
         jumps = np.abs(np.diff(self.static, prepend=self.static[0])) > JUMP * np.ptp(self.static)
         self.kept = ~(jumps | np.roll(jumps, 1))
+        first = settled(measurement) if is_loop(measurement.voltage) else 0
+        # Where the first rise from rest ends is where the operator was identified from.
+        self.kept[: -(-first // block)] = False
+        self.is_loop = is_loop(measurement.voltage[first:])
+
+    def is_same_loop(self, other: _Means) -> bool:
+        """Say whether both are loops under one voltage, at temperatures that differ."""
+        return (
+            self.is_loop
+            and self.voltage.shape == other.voltage.shape
+            and np.ptp(self.voltage - other.voltage) <= 1e-3 * np.ptp(self.voltage)
+            and abs(self.temperature[0] - other.temperature[0]) >= SMALLEST_WARMING
+        )
 
     def relax(self, values: NDArray, time_constant: float, start: float) -> NDArray:
         """Return `values`, held over each block, behind a first-order lag from `start`."""
-        retained = np.exp(-self.step / time_constant)
-        return start + lfilter([1.0 - retained], [1.0, -retained], values - start)
+        return _relax(values, time_constant, start, self.step)
 
 
 def identify_drift(
@@ -124,12 +167,28 @@ def identify_drift(
     coldest = min(float(r.temperature.min()) for r in recordings) - REFERENCE_DEGC
     spans_temperatures = warmest - coldest >= SMALLEST_WARMING and warmest > 0.0
     longest = max(float(r.time[-1]) for r in recordings)
-    shortest = max(r.step for r in recordings)
-    measured = np.concatenate([r.deflection[r.kept] for r in recordings])
+    slowest = max(r.step for r in recordings)
+    times = np.geomspace(slowest, 0.5 * longest, RELAXATIONS)
+    # What the operator leaves of a loop is the same at another temperature, and larger than what that
+    # changes: two such loops count by their difference.
+    twins = [
+        (n, m)
+        for n, m in itertools.combinations(range(len(recordings)), 2)
+        if recordings[n].is_same_loop(recordings[m])
+    ]
+    single = [n for n in range(len(recordings)) if not any(n in twin for twin in twins)]
+    deflections = [r.deflection[r.kept] for r in recordings]
+
+    def rows(blocks: Sequence[NDArray]) -> NDArray:
+        """Return the rows that are fitted, of those of every recording."""
+        return np.concatenate(
+            [*(blocks[n] for n in single), *(blocks[m] - blocks[n] for n, m in twins)]
+        )
+
+    measured = rows(deflections)
     scale = float(np.std(measured))
 
-    def regressors(logs: NDArray, cold_share: float) -> NDArray:
-        time_constant, *times = np.exp(logs)
+    def regressors(time_constant: float, cold_share: float) -> list[NDArray]:
         blocks = []
         for number, r in enumerate(recordings):
             body = r.relax(r.temperature, time_constant, float(r.temperature[0]))
@@ -140,68 +199,75 @@ def identify_drift(
             columns = [r.relax(r.voltage * strength, t, 0.0) for t in times]
             columns.append(body - body[0])
             columns.append(warmth * r.static)
+            columns.append(-warmth * r.lag if twins else np.zeros_like(warmth))
             columns.append(r.static)
             offsets = np.zeros((len(body), len(recordings)))
-            offsets[:, number] = 1.0
+            offsets[:, number] = number not in dict(twins)  # a difference has one offset
             blocks.append(np.column_stack((*columns, offsets))[r.kept])
-        return np.concatenate(blocks)
+        return blocks
 
-    lowest = np.full(RELAXATIONS + 3 + len(recordings), -np.inf)
+    lowest = np.full(RELAXATIONS + 4 + len(recordings), -np.inf)
     lowest[:RELAXATIONS] = 0.0
 
-    def linear(logs: NDArray, cold_share: float) -> tuple[NDArray, NDArray]:
-        matrix = regressors(logs, cold_share)
+    def linear(time_constant: float, cold_share: float) -> tuple[NDArray, NDArray]:
+        matrix = rows(regressors(time_constant, cold_share))
         norms = column_norms(matrix)
         triangle = np.linalg.qr(np.column_stack((matrix / norms, measured)), mode="r")
         x = lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x / norms
         return x, measured - matrix @ x
 
-    start = np.log([0.1 * longest * 1e-2, *(longest * np.array([0.006, 0.06, 0.4]))])
-    start = np.maximum(start, np.log(2.0 * shortest))
-    low = np.append(np.full(len(start), np.log(0.1 * shortest)), -0.5)
-    high = np.append(np.full(len(start), np.log(3.0 * longest)), 1.0)
+    low = np.array([np.log(0.1 * slowest), 0.0])
+    high = np.array([np.log(3.0 * longest), 1.0])
     found = least_squares(
-        lambda p: linear(p[:-1], p[-1])[1] / scale, np.append(start, 0.3), bounds=(low, high)
+        lambda p: linear(np.exp(p[0]), p[1])[1] / scale,
+        (np.log(1e-3 * longest + 2.0 * slowest), 0.3),
+        bounds=(low, high),
     )
     if not spans_temperatures:
         warmest = 1.0
 
     def values(numbers: NDArray) -> dict[str, Any]:
-        logs, (cold_share, *x) = numbers[: RELAXATIONS + 1], numbers[RELAXATIONS + 1 :]
-        time_constant, *times = np.exp(logs).tolist()
-        amounts = np.array(x[:RELAXATIONS])
+        (log, cold_share), amounts = numbers[:2], numbers[2 : 2 + RELAXATIONS]
+        shift, growth, widening, static = numbers[2 + RELAXATIONS : 6 + RELAXATIONS].tolist()
         total = float(np.sum(amounts))
         cold_share = float(cold_share) if spans_temperatures else 1.0
-        order = np.argsort(times)
         shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
+        gain_per_degc = growth / static if (warming and creeping) or twins else 0.0
         return {
             "creep_gain": total * cold_share,
             "creep_gain_per_degc": total * (1.0 - cold_share) / warmest,
-            "creep_times": tuple(float(times[i]) for i in order),
-            "creep_shares": tuple(float(shares[i]) for i in order),
-            "sensitivity": float(x[RELAXATIONS]) if warming else 0.0,
-            "time_constant": time_constant if warming else 0.0,
-            "gain_per_degc": float(x[RELAXATIONS + 1] / x[RELAXATIONS + 2])
-            if warming and creeping
-            else 0.0,
+            "creep_shares": tuple(shares[there].tolist()),
+            "sensitivity": shift if warming else 0.0,
+            "time_constant": float(np.exp(log)) if warming else 0.0,
+            "gain_per_degc": gain_per_degc,
+            # The lag grows with the stroke, too, at the temperature at which it was seen.
+            "lag_per_degc": widening / static / (1.0 + gain_per_degc * warmest) if twins else 0.0,
         }
 
-    x, deviation = linear(found.x[:-1], float(found.x[-1]))
+    def modelled(searched: NDArray) -> list[NDArray]:
+        return regressors(np.exp(searched[0]), searched[1])
+
+    x, deviation = linear(np.exp(found.x[0]), found.x[1])
+    amounts = x[:RELAXATIONS]
+    there = (amounts > 0.0) | (np.sum(amounts) == 0.0)
     numbers = np.append(found.x, x)
-    matrix = regressors(found.x[:-1], float(found.x[-1]))
     free = np.append((found.x > low) & (found.x < high), x > lowest)
-    searched = []
-    for step in 1e-4 * np.eye(found.x.size):
-        after, before = (regressors(p[:-1], p[-1]) for p in (found.x + step, found.x - step))
-        searched.append((after - before) @ x / (2.0 * step.sum()))
-    jacobian = np.column_stack((*searched, matrix)) * free
-    ends = np.cumsum([np.sum(r.kept) for r in recordings])[:-1]
-    modelled = np.split(measured - deviation, ends)
+    searched = [
+        rows(
+            [after - before for after, before in zip(modelled(found.x + h), modelled(found.x - h))]
+        )
+        @ x
+        / (2.0 * h.sum())
+        for h in 1e-4 * np.eye(found.x.size)
+    ]
+    jacobian = np.column_stack((*searched, rows(modelled(found.x)))) * free
+    curves = [block @ x for block in modelled(found.x)]
     return DriftModel(
         **values(numbers),
+        creep_times=tuple(times[there].tolist()),
         fitted=tuple(
-            np.column_stack((r.time[r.kept], r.deflection[r.kept], m))
-            for r, m in zip(recordings, modelled)
+            np.column_stack((r.time[r.kept], deflection, m + np.mean(deflection) - np.mean(m)))
+            for r, deflection, m in zip(recordings, deflections, curves)
         ),
         without=tuple(straight(r.deflection[r.kept], r.static[r.kept]) for r in recordings),
         confidence=intervals(values, numbers, jacobian, deviation),

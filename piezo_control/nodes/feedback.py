@@ -12,7 +12,9 @@ sample at which it is. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
 loop runs, with the command where it was. With `force_control`, in place of the controller, the loop follows the
 reference as long as the tip pushes with no more than the profile's `max_force` and its own `touch.force_limit`,
-and holds that force where something is in the way (:mod:`piezo_control.touch`). Running free, nothing is
+and holds that force where something is in the way (:mod:`piezo_control.touch`). With `preview_band` profiles and
+waveforms are followed without lag, as far as the controller's band goes (:mod:`piezo_control.design.preview`).
+Running free, nothing is
 answered before the deflections come at the sample time that the controller was made for, and a loop that falls
 behind ends in a fault.
 """
@@ -28,6 +30,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
+from piezo_control.design.preview import asked
 from piezo_control.feedback import Feedback, FeedbackParameters, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
@@ -35,14 +38,15 @@ from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, flatten
+from piezo_control.profile import SampledSignal
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
 from piezo_control.touch import Touch
 from piezo_gripper_msgs.msg import Sample
 
 PUSH_PERIOD = 1e-2  # s, between two of the push
 
-# What makes a controller; its limits of the command may change by themselves.
-DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high"}
+# What makes a controller; its limits of the command and its preview may change by themselves.
+DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high", "preview_band"}
 
 
 class FeedbackNode(BlockNode):
@@ -64,8 +68,14 @@ class FeedbackNode(BlockNode):
         self._take_file()
         self.restart_law()
         self.reference = ProfileInput(
-            self, "reference", self.parameters.sample_time, LARGEST_DEFLECTION, says=True
+            self,
+            "reference",
+            self.parameters.sample_time,
+            LARGEST_DEFLECTION,
+            self._look_ahead,
+            says=True,
         )
+        self._look_ahead()
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
         fixed = {"mode", "sample_time", "subscribers", "age_limit", "force_control"}
@@ -103,6 +113,12 @@ class FeedbackNode(BlockNode):
     def restart(self) -> None:
         self.restart_law()
         self.reference.restart(self.parameters.sample_time)
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """Prepare what the controller is asked for the reference that is followed from now on."""
+        p = self.parameters
+        self.asked = SampledSignal(asked(self.reference.signal, p), p.sample_time)
 
     def restart_law(self) -> None:
         """Begin with the controller at rest."""
@@ -148,12 +164,13 @@ class FeedbackNode(BlockNode):
             state = self.touch.state
             self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
             self.touch.state = state
+            self._look_ahead()
 
     def _started(self, parameters: FeedbackNodeParameters) -> Feedback:
         """Return the law of `parameters`, started where the loop is; ValueError when it cannot be."""
         law = Feedback(parameters)
         if self.sequence.next > 0:
-            law.start(self.reference[self.sequence.next - 1], self.deflection, self.last.value)
+            law.start(self.asked[self.sequence.next - 1], self.deflection, self.last.value)
         return law
 
     def _take_file(self) -> bool:
@@ -219,7 +236,7 @@ class FeedbackNode(BlockNode):
         p, reference = self.parameters, self.reference[sample.number]
         answer.by_controller = self._has_a_rate()
         if not p.force_control:
-            answer.value = self.law.step(reference, sample.value)
+            answer.value = self.law.step(self.asked[sample.number], sample.value)
         elif self._is_expected():
             answer.value = self.touch.step(
                 reference, sample.value, self.expected.value, self.reference.max_force

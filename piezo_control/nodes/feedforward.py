@@ -2,7 +2,8 @@
 """The block H_s⁻¹ of the paper's loop: from the commanded deflection to the voltage.
 
 in:  command (Sample, m), state (FingerState: the voltage that is applied when this node starts),
-     temperature (sensor_msgs/Temperature, °C) with `compensator: sensorless`
+     temperature (sensor_msgs/Temperature, °C) with `compensator: sensorless`,
+     deflection (Sample, m) with that and `adaptation.time_constant`
 out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator;
      expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later
 
@@ -12,7 +13,8 @@ rest too, in either mode. A restart goes on from the voltage that is applied.
 
 With `compensator: sensorless` a command that is the reference itself goes through the models of hysteresis,
 vibration, creep and heat; a controller's command goes through the inverse hysteresis, and the models follow.
-So a `feedback` that is told `controller: none` in mid-run leaves a finger that goes on without a bump. A
+So a `feedback` that is told `controller: none` in mid-run leaves a finger that goes on without a bump, with
+models that were adapted to the deflections until then, where `adaptation.time_constant` is not 0. A
 temperature that is missing or frozen is named in `state`, on `/diagnostics` and in the log, until it is back.
 """
 
@@ -22,17 +24,20 @@ import math
 import time
 from typing import Any
 
+from rclpy.subscription import Subscription
+
 from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
-from piezo_control.nodes.qos import LATCHED
+from piezo_control.nodes.qos import LATCHED, SAMPLE
 from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
     FAULT,
     LARGEST_DEFLECTION,
     RAMP_PERIOD,
     RAMPING,
+    is_physical,
     limits,
 )
 from piezo_control.sensorless import Sensorless
@@ -57,6 +62,8 @@ class FeedforwardNode(BlockNode):
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
         self._temperature_input: TemperatureInput | None = None
+        self._deflection_input: Subscription | None = None
+        self._deflection = Sample(value=math.nan)  # the newest that the models may adapt to
         self._complained = ""
         self._build(self.parameters.rest)
 
@@ -78,6 +85,11 @@ class FeedforwardNode(BlockNode):
         self._temperatures.clear()
         if self.parameters.compensator == "sensorless":
             self._temperature_input = TemperatureInput(self, self._on_temperature)
+            self._deflection = Sample(value=math.nan)
+            if self.parameters.adaptation.time_constant:
+                self._deflection_input = self.create_subscription(
+                    Sample, "deflection", self._on_deflection, SAMPLE
+                )
         if self.parameters.mode == "free_running":
             self.watchdog.reset()
 
@@ -115,10 +127,20 @@ class FeedforwardNode(BlockNode):
         p = self.parameters
         return p.temperature_lockstep and p.mode == "lockstep"
 
+    def _on_deflection(self, sample: Sample) -> None:
+        if is_physical(sample.value, LARGEST_DEFLECTION):
+            self._deflection = sample
+            self.go_on()
+
     def prepare(self, sample: Sample) -> str:
-        """Take up the temperature of this sample."""
+        """Take up the temperature of this sample; the deflection that its command answers has to be there, too."""
         p, number = self.parameters, sample.number
-        if p.compensator != "sensorless" or not p.temperature_lockstep:
+        if p.compensator != "sensorless":
+            return ""
+        adapts = sample.by_controller and bool(p.adaptation.time_constant)
+        if adapts and not self._is_read(sample):
+            return "its deflection"
+        if not p.temperature_lockstep:
             return ""
         place = grid_index(number, p.sample_time, p.temperature_period)
         if place not in self._temperatures:
@@ -128,6 +150,10 @@ class FeedforwardNode(BlockNode):
         self.thermometer.hear(self._temperatures[place], number * p.sample_time)
         self._temperatures = {n: t for n, t in self._temperatures.items() if n >= place}
         return ""
+
+    def _is_read(self, sample: Sample) -> bool:
+        """Say whether the deflection that a command answers is known."""
+        return self._deflection.number == sample.number and not math.isnan(self._deflection.value)
 
     def _read(self, law: Sensorless, now: float) -> float:
         """Return the temperature (°C), NaN for one that cannot be believed, and say so once."""
@@ -165,8 +191,11 @@ class FeedforwardNode(BlockNode):
             answer.without_temperature = bool(self.thermometer.wrong)
             if is_free and sample.number > self.last.number + 1:
                 self.law.pause(sample.number - self.last.number - 1)
-            answer_to = self.law.lead if sample.by_controller else self.law.step
-            answer.value = answer_to(sample.value, degc, share)
+            if sample.by_controller:
+                deflection = self._deflection.value if self._is_read(sample) else math.nan
+                answer.value = self.law.lead(sample.value, degc, share, deflection)
+            else:
+                answer.value = self.law.step(sample.value, degc, share)
             self._expect(sample)
         else:
             answer.value = self.law.step(sample.value, share)
@@ -192,6 +221,9 @@ class FeedforwardNode(BlockNode):
                 "expected deflection": self.law.predicted,
             }
             wrong = wrong or self.thermometer.wrong
+            if self.parameters.adaptation.time_constant:
+                adapted = self.law.state.adapted
+                figures |= {"adapted gain": adapted.gain[0], "adapted offset": adapted.offset[0]}
         return wrong, figures
 
     def reset(self) -> None:
@@ -206,6 +238,9 @@ class FeedforwardNode(BlockNode):
         if self._temperature_input:
             self._temperature_input.close()
             self._temperature_input = None
+        if self._deflection_input:
+            self.destroy_subscription(self._deflection_input)
+            self._deflection_input = None
         self.watchdog.cancel()
         self.guard.trip("stopped", time.monotonic())
         while self.guard.phase == RAMPING:

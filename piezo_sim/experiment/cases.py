@@ -68,6 +68,7 @@ RUN_KEYS = {
     "voltage": "profile of the voltage instead, in open loop: shape, amplitude_v, …",
     "tip_force": "profile of a force on the tip: shape, amplitude_mn, …",
     "temperature": "parameters of the temperature node instead of temperature_degc",
+    "preview_band": "with feedback: the reference is followed without lag below this frequency (Hz)",
 }
 """Keys of a run; those of the experiment hold where a run does not say otherwise."""
 NEEDED_KEYS = ("name", "duration", "sample_time", "mode")
@@ -103,6 +104,7 @@ class Case:
     engine: bool = False
     every: int = 1
     params: Path | None = None
+    preview_band: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -147,6 +149,8 @@ class Case:
         given = {n: own_parameters(self.params, n) for n in NODES}
         if self.mode == "feedback":
             given["feedback"] = flatten(read_controller(self.controller, self.params))
+            if self.preview_band:
+                given["feedback"]["preview_band"] = self.preview_band
         parameters: dict[str, Any] = {}
         for name, kind in NODES.items():  # the feedforward first: it knows what can be reached
             if name == "feedback" and self.mode != "feedback":
@@ -352,6 +356,7 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
                 engine=run.get("engine", False),
                 every=run.get("every", 1),
                 params=run.get("params"),
+                preview_band=run.get("preview_band", 0.0),
             )
         )
     return cases

@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "thermal": "a spotlight warms the finger while it holds",
     "force": "a force on the tip while the finger holds",
     "excite": "decaying sine of the voltage, made for `identify hysteresis`",
+    "identification": "recordings for all of `identify`: loops, creep, a step, a warm-up",
     "all": "all of those of the paper with two controllers, against the paper: `make paper`",
 }
 DONE, FAILED, UNUSABLE = 0, 1, 2
@@ -86,15 +87,18 @@ def run_into(
         runs.sort(key=lambda run: cases.index(run.case))
         task = progress.add_task("analysis of the bags", total=len(runs))
         found = [results.result(run) for run in progress.track(runs, task_id=task)]
-    content = results.metrics(found, out)
-    sections = results.sections(found, out)
-    if arguments.command == "all":
-        sections.insert(0, paper.section(found))
-        content["paper"] = paper.compare(found)
-        from piezo_sim.experiment import sensorless  # scipy, for `all` alone
+        content = results.metrics(found, out)
+        sections = results.sections(found, out)
+        if arguments.command == "all":
+            sections.insert(0, paper.section(found))
+            content["paper"] = paper.compare(found)
+            from piezo_sim.experiment import baselines, sensorless  # scipy, for `all` alone
 
-        content["sensorless"], tables = sensorless.study()
-        sections += tables
+            folder = out / "sensorless"
+            content["sensorless"], pages = sensorless.study(folder, arguments.namespace, progress)
+            known = sensorless.models_folder(folder, "truth", sensorless.CONTROLLER)
+            plants = {"prandtl_ishlinskii": None, "truth": known}
+            sections += [*pages, baselines.study(out / "baselines", plants, progress)]
     sections += [results.definitions(r.figures for r in found), results.parameters(cases)]
     verdict = paper.verdict(found)
     results.write_metrics(content, out)

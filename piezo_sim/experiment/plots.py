@@ -122,6 +122,16 @@ def force(panels: Panels, path: Path) -> Path:
     return _disturbance(panels, path, "tip_force", "tip force [mN]", MN)
 
 
+def errors(panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], path: Path) -> Path:
+    """Draw errors (%) over time (s), a panel for each task and a line for each way to do it."""
+    figure, axes = _panels(panels)
+    for axis, lines in zip(axes, panels.values()):
+        for colour, (label, (time, error)) in zip(OTHERS, lines.items()):
+            axis.plot(time, error, color=colour, lw=0.8, label=label)
+    _finish(axes, "t [s]", "error [%]")
+    return _save(figure, path)
+
+
 PLOTS: dict[str, Callable[[Panels, Path], Path]] = {
     plot.__name__: plot
     for plot in (transient, creep, hysteresis, excite, feedforward, step, frequency, thermal, force)

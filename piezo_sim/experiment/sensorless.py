@@ -1,111 +1,90 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each model of the sensorless feedforward is worth, on a finger known from recordings alone.
 
-The finger is excited and identified as on a bench: a decaying sine (hysteresis), steps of the voltage held
-for 300 s at two temperatures and a warm-up at 0 V (creep and heat), all read through its sensor. Then steps,
-holds and sines run without the sensor: with the inverse hysteresis alone, and with vibration, creep and heat
-added one by one. Errors are those of the true tip, in % of the stroke of 40 µm for sines and of the step of
-20 µm else.
+The finger is excited (`experiment identification`) and identified by the commands of docs/sensorless.md,
+through its sensor. Then steps, holds and sines run without the sensor: with the inverse hysteresis alone,
+with vibration, creep and heat added one by one, and with a controller beside. Figures are computed from the
+bags, from the tip as the sensor read it: in % of the stroke of 40 µm, for the step of its 20 µm. With all
+models the finger is led over topics, by the nodes; for the stages before, and for the controller, the engine
+writes the bags.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import contextlib
 import sys
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 
 from piezo_control.creep import CreepParameters
-from piezo_control.identification.drift import identify_drift
-from piezo_control.identification.excitation import decaying_sine
-from piezo_control.identification.hysteresis import equal_thresholds, identify_hysteresis
-from piezo_control.identification.measurement import Measurement
+from piezo_control.identification import cli as identify
+from piezo_control.nodes.parameters import FeedforwardNodeParameters
+from piezo_control.parameters import build, dump, flatten, load
 from piezo_control.profile import Profile
+from piezo_control.recording.recording import Recording, read
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.shaping import ShapingParameters, delay, shaper
 from piezo_control.thermal import ThermalParameters
-from piezo_sim.engine import drive, run_sensorless
-from piezo_sim.experiment.report import Section, print_table, write_html
-from piezo_sim.plant.cantilever import CantileverParameters
-from piezo_sim.temperature import TemperatureParameters
+from piezo_sim.experiment import plots
+from piezo_sim.experiment import study as command_line
+from piezo_sim.experiment.cases import Case, RunFailed, read_experiment
+from piezo_sim.experiment.cli import run_all
+from piezo_sim.experiment.on_engine import run_on_engine
+from piezo_sim.experiment.report import Section
+from piezo_sim.plant.sensor import SensorParameters
 
 PLANTS = ("prandtl_ishlinskii", "truth")
+CONTROLLER = "robust"
 SAMPLE_TIME = 1e-4  # s
+SLOW = 2e-2  # s, sample time of a hold of minutes without a controller
 STEP = 20e-6  # m
-STEPS_AT = 1.1  # s
-HOLD = 300.0  # s
 STROKE = 2.0 * STEP
+HOLD = 300.0  # s
+START = 0.1  # s, of a sine
+CYCLE = 1.0  # s, of the sine before a step, which makes the hysteresis forget the first rise
 COLD, WARM = 22.0, 32.0  # °C
-PLAYS = 16
-SLOW = 1e-2  # s, sample time of the recordings for creep and heat
-QUICK = 1e-3  # s, of the one for hysteresis
 TEXT = (
-    "Computed by the engine, not from bags: models identified from recordings of the finger, and no sensor "
-    "in the loop. Errors of the true tip; "
-    "step and hold follow one cycle of a sine, sines start from rest and are known ahead by the delay."
+    "Models identified from recordings of the finger, and no sensor in the loop; largest errors, as the sensor "
+    "read the tip. With heat, the last of the models, from node processes over topics in lock-step; the stages "
+    f"before and the controller '{CONTROLLER}' from the engine. Step and hold follow a cycle of a sine, sines "
+    "start from rest; without a controller they are known ahead by the shaper's delay."
 )
 NO_CREEP = CreepParameters(gain=0.0, gain_per_degc=0.0)
 NO_HEAT = ThermalParameters(sensitivity=0.0, gain_per_degc=0.0, lag_per_degc=0.0)
+NO_FORCE = Profile([0.0], [0.0])
+ALL_MODELS = "+ heat"
 
 
-def constant(degc: float) -> TemperatureParameters:
-    """Return a temperature that stays."""
-    return TemperatureParameters(base_degc=degc)
+# --- models ---------------------------------------------------------------------------------------
 
 
-def warming(start: float, duration: float) -> TemperatureParameters:
-    """Return the way from COLD to WARM, in s."""
-    return TemperatureParameters(
-        profile="ramp", base_degc=COLD, amplitude_degc=WARM - COLD, start=start, duration=duration
-    )
+def identified(plant: str, out: Path) -> FeedforwardNodeParameters:
+    """Excite a finger on the engine, identify it by the commands, and return what the feedforward loads.
 
-
-def recorded(
-    plant: CantileverParameters,
-    sample_time: float,
-    voltage: Profile,
-    temperatures: TemperatureParameters,
-    duration: float,
-) -> Measurement:
-    """Return what a recorder keeps of the bare finger under `voltage`."""
-    got = drive(
-        replace(plant, sample_time=sample_time),
-        temperatures,
-        voltage,
-        round(duration / sample_time),
-    )
-    # Sample k of the deflection is read a sample late and before voltage k acts.
-    late = 1 + plant.sensor.delay_samples
-    return Measurement(
-        "engine", got.time[late:], got.voltage[:-late], got.deflection[late:],
-        got.temperature[:-late], None, got.number[late:],
-    )  # fmt: skip
-
-
-def identified(plant: CantileverParameters) -> SensorlessParameters:
-    """Return the models of a finger from recordings of it; its resonance is taken as known."""
-    sine = recorded(plant, QUICK, decaying_sine(40.0), constant(COLD), 20.0)
-    hysteresis = identify_hysteresis(sine, equal_thresholds(sine, PLAYS), lag=0.0).parameters
-    step = Profile([0.0, 1.0], [0.0, 40.0])
-    drifting = [recorded(plant, SLOW, step, constant(degc), 300.0) for degc in (COLD, WARM)]
-    drifting.append(recorded(plant, SLOW, Profile([0.0], [0.0]), warming(2.0, 5.0), 20.0))
-    drift = identify_drift(drifting, hysteresis)
-    return SensorlessParameters(
-        slew_limit=plant.amplifier.slew_limit,
-        hysteresis=hysteresis,
-        dynamics=plant.dynamics,
-        creep=CreepParameters(
-            drift.creep_gain, drift.creep_gain_per_degc, drift.creep_times, drift.creep_shares
-        ),
-        thermal=ThermalParameters(
-            drift.sensitivity, drift.time_constant, drift.gain_per_degc, lag_per_degc=0.0
-        ),
-    )
+    Bags and parameter files go to `out`. The limits of the voltage are those of the paper's amplifier.
+    """
+    _, cases = read_experiment("identification", {"plant": plant, "engine": True})
+    with Progress(disable=True) as progress:
+        bags = {c.name: str(run_on_engine(c, out, "finger", progress).bag) for c in cases}
+    drifting = [bag for name, bag in bags.items() if not name.startswith("vibration")]
+    with (out / "identify.log").open("w") as log, contextlib.redirect_stdout(log):
+        for words in (
+            # The last loops are the smallest, which no others tell: nothing is held back.
+            [*"hysteresis --model classical --plays 16 --hold-back 0".split(), bags["loop_22degc"]],
+            ["dynamics", bags["vibration_22degc"]],
+            ["drift", *drifting],
+        ):
+            if identify.main([*words, "--out", str(out)]):
+                raise RunFailed(f"identify {words[0]} failed on plant '{plant}'")
+    path = out / "feedforward.yaml"
+    return build(FeedforwardNodeParameters, load(path, "feedforward"), str(path))
 
 
 def stages(models: SensorlessParameters) -> Iterator[tuple[str, SensorlessParameters]]:
@@ -114,98 +93,213 @@ def stages(models: SensorlessParameters) -> Iterator[tuple[str, SensorlessParame
     yield "hysteresis", alone
     yield "+ vibration", replace(alone, shaping=models.shaping)
     yield "+ creep", replace(alone, shaping=models.shaping, creep=models.creep)
-    yield "+ heat", models
+    yield ALL_MODELS, models
 
 
-def late(models: SensorlessParameters) -> float:
-    """Return by how much (s) a finger under these models comes late, held sample and shaper."""
-    taps = shaper(models.shaping, models.dynamics.denominator, SAMPLE_TIME)
-    return delay(taps, SAMPLE_TIME) + SAMPLE_TIME
+# --- what is asked of the tip -----------------------------------------------------------------------
 
 
-def step_error(plant: CantileverParameters, models: SensorlessParameters) -> float:
-    """Return the largest error from 2 ms after a step on (m), at COLD."""
-    got = run_sensorless(plant, models, constant(COLD), after_a_cycle(), round(1.3 / SAMPLE_TIME))
-    return float(np.max(np.abs(got.true_deflection - STEP)[got.time >= STEPS_AT + 2e-3]))
+@dataclass(frozen=True)
+class Task:
+    """Where the tip has to be over time (s, m), from when on that counts, and how warm it is meanwhile."""
+
+    name: str
+    wanted: Profile
+    begin: float
+    duration: float
+    temperature: Mapping[str, Any]
+    unit: float = STROKE  # m, that is 100 %
+    is_known_ahead: bool = False
+    is_slow: bool = False
+
+    def case(self, mode: str, models: SensorlessParameters, folder: Path) -> Case:
+        """Return the run in `mode`, with the parameter files in `folder`."""
+        is_slow = self.is_slow and mode == "sensorless"
+        sample_time = SLOW if is_slow else SAMPLE_TIME
+        ahead = 0.0
+        if self.is_known_ahead and mode == "sensorless":
+            taps = shaper(models.shaping, models.dynamics.denominator, sample_time)
+            ahead = delay(taps, sample_time) + sample_time  # of the held sample
+        return Case(
+            name=f"{folder.name}_{self.name}",
+            mode=mode,
+            controller=CONTROLLER if mode == "feedback" else "none",
+            plant=folder.parent.name,
+            sample_time=sample_time,
+            duration=self.duration,
+            reference=Profile(self.wanted.time - ahead, self.wanted.value, linear=True),
+            tip_force=NO_FORCE,
+            temperature=self.temperature,
+            experiment="sensorless",
+            every=1 if is_slow or self.duration < 2.0 else 10 if self.duration < HOLD else 100,
+            params=folder,
+        )
+
+    def error(self, recording: Recording) -> tuple[np.ndarray, np.ndarray]:
+        """Return time (s) and error (%) of the tip, from `begin` on."""
+        # A reading is one of the tip `delay_samples` before.
+        spacing = float(np.min(np.diff(recording.number)))
+        late = recording.sample_time / spacing * SensorParameters().delay_samples
+        time = recording.time - late
+        error = 100.0 * (recording.deflection - self.wanted.at(time)) / self.unit
+        counts = time >= self.begin - 1e-9
+        return time[counts], error[counts]
 
 
-def hold_error(
-    plant: CantileverParameters, models: SensorlessParameters, temperatures: TemperatureParameters
-) -> float:
-    """Return the largest error (m) in HOLD seconds after a step, from 50 ms on."""
-    samples = round((STEPS_AT + HOLD) / SAMPLE_TIME)
-    got = run_sensorless(plant, models, temperatures, after_a_cycle(), samples, every=10)
-    return float(np.max(np.abs(got.true_deflection - STEP)[got.time >= STEPS_AT + 0.05]))
+def constant(degc: float) -> dict[str, Any]:
+    """Return a temperature that stays."""
+    return {"profile": "constant", "base_degc": degc}
 
 
-def sine_error(
-    plant: CantileverParameters, models: SensorlessParameters, frequency_hz: float, degc: float
-) -> float:
-    """Return the largest error (m) over three cycles of a sine from rest, known ahead by the delay."""
-    time = np.arange(round((0.1 + 3.0 / frequency_hz) / SAMPLE_TIME)) * SAMPLE_TIME
-
-    def wanted(instant: np.ndarray) -> np.ndarray:
-        return STEP * np.sin(2.0 * np.pi * frequency_hz * np.maximum(instant - 0.1, 0.0))
-
-    ahead = Profile(time, wanted(time + late(models)))
-    got = run_sensorless(plant, models, constant(degc), ahead, len(time))
-    return float(np.max(np.abs(got.true_deflection - wanted(got.time))))
+def warming(start: float, duration: float) -> dict[str, Any]:
+    """Return the way from COLD to WARM, in s."""
+    return {
+        "profile": "ramp",
+        "base_degc": COLD,
+        "amplitude_degc": WARM - COLD,
+        "start": start,
+        "duration": duration,
+    }
 
 
-def after_a_cycle() -> Profile:
-    """Return one cycle of a sine, which makes the hysteresis forget the first rise, and then a step."""
-    time = np.arange(0.0, 1.0, 1e-3)
-    return Profile([*time, STEPS_AT], [*(STEP * np.sin(2.0 * np.pi * time)), STEP])
+def after_a_cycle(rise: float) -> Profile:
+    """Return one cycle of a sine, a rest, and STEP from then on, reached within `rise` (s)."""
+    time = np.arange(0.0, CYCLE, 1e-3)
+    sine = STEP * np.sin(2.0 * np.pi * time / CYCLE)
+    until = 1.1 * CYCLE
+    return Profile([*time, CYCLE, until, until + rise], [*sine, 0.0, 0.0, STEP], linear=True)
 
 
-def errors(
-    plant: CantileverParameters, models: SensorlessParameters
-) -> Iterator[tuple[str, float]]:
-    """Yield the name and value (%) of each error, with the hold and the sines relative to the stroke."""
-    yield "step, after 2 ms [% of step]", 100.0 * step_error(plant, models) / STEP
-    for name, temperatures in (
-        (f"{COLD:g} °C", constant(COLD)),
-        (f"{WARM:g} °C", constant(WARM)),
-        (f"{COLD:g} to {WARM:g} °C", warming(10.0, 60.0)),
+def sine(frequency_hz: float) -> Profile:
+    """Return three cycles of a sine of STEP that start from rest after START s."""
+    time = np.linspace(0.0, 3.0 / frequency_hz, 3001)
+    value = STEP * np.sin(2.0 * np.pi * frequency_hz * time)
+    return Profile(START + time, value, linear=True)
+
+
+def tasks() -> Iterator[Task]:
+    """Yield step, holds and sines, cold, warm and on the way."""
+    end = 1.1 * CYCLE
+    yield Task("step_22degc", after_a_cycle(1e-9), end + 2e-3, end + 0.2, constant(COLD), STEP)
+    for name, temperature in (
+        ("22degc", constant(COLD)),
+        ("32degc", constant(WARM)),
+        ("22_to_32degc", warming(10.0, 60.0)),
     ):
-        error = hold_error(plant, models, temperatures)
-        yield f"hold {HOLD:g} s, {name} [% of stroke]", 100.0 * error / STROKE
+        # The voltage rises within 0.2 s, so that nothing vibrates between two slow samples.
+        hold = after_a_cycle(0.2)
+        yield Task(f"hold_{name}", hold, end + 0.3, end + 0.3 + HOLD, temperature, is_slow=True)
     for degc in (COLD, WARM):
-        for frequency in (1.0, 10.0, 50.0):
-            error = sine_error(plant, models, frequency, degc)
-            yield f"{frequency:g} Hz, {degc:g} °C [% of stroke]", 100.0 * error / STROKE
+        for hertz in (1.0, 10.0, 50.0):
+            name = f"{hertz:g}hz_{degc:g}degc"
+            wanted = sine(hertz)
+            end = float(wanted.time[-1])
+            yield Task(name, wanted, 0.0, end, constant(degc), is_known_ahead=True)
 
 
-def study() -> tuple[dict[str, dict[str, dict[str, float]]], list[Section]]:
-    """Identify both plants and run all stages; return the errors (%) and a table for each plant."""
-    found = {}
+# --- the study ------------------------------------------------------------------------------------
+
+
+def models_folder(out: Path, plant: str, stage: str) -> Path:
+    """Return the folder of the parameter file of a stage, by the last of its models."""
+    return out / "models" / plant / stage.removeprefix("+ ")
+
+
+def cases(plant: str, models: FeedforwardNodeParameters, out: Path) -> dict[str, dict[str, Case]]:
+    """Return the runs of each stage by name of the task; their parameter files go below `out`."""
+    found: dict[str, dict[str, Case]] = {}
+    for stage, parameters in [*stages(models), (CONTROLLER, models)]:
+        mode = "feedback" if stage == CONTROLLER else "sensorless"
+        found[stage] = {}
+        for task in tasks():
+            shown = parameters
+            folder = models_folder(out, plant, stage)
+            if task.is_slow and mode == "sensorless":
+                # Between two slow samples any vibration fades: there is nothing to shape.
+                shown = replace(parameters, shaping=ShapingParameters(kind="none"))
+                folder = folder.with_name(f"{folder.name}_slow")
+            folder.mkdir(parents=True, exist_ok=True)
+            dump(folder / "feedforward.yaml", "feedforward", flatten(shown))
+            case = task.case(mode, shown, folder)
+            found[stage][task.name] = replace(
+                case, name=f"{plant}_{case.name}", engine=stage != ALL_MODELS
+            )
+    return found
+
+
+def study(
+    out: Path, namespace: str, progress: Progress, is_on_nodes: bool = True
+) -> tuple[dict[str, dict[str, dict[str, float]]], list[Section]]:
+    """Identify both plants and run all stages; return the largest errors (%) and a section for each plant."""
+    wanted = {
+        plant: cases(plant, identified(plant, out / "identified" / plant), out) for plant in PLANTS
+    }
+    listed = [
+        replace(case, engine=case.engine or not is_on_nodes)
+        for by_stage in wanted.values()
+        for by_task in by_stage.values()
+        for case in by_task.values()
+    ]
+    runs = {run.case.name: run for run in run_all(listed, out, namespace, progress)}
+    found: dict[str, dict[str, dict[str, float]]] = {}
     sections = []
-    for kind in PLANTS:
-        plant = CantileverParameters(plant=kind)
-        models = identified(plant)
-        by_stage = {name: dict(errors(plant, stage)) for name, stage in stages(models)}
-        names = list(next(iter(by_stage.values())))
-        rows = [[n, *(f"{stage[n]:.2f}" for stage in by_stage.values())] for n in names]
-        title = f"Without a sensor, plant {kind}"
-        sections.append(Section(title, TEXT, columns=["largest error", *by_stage], rows=rows))
-        found[kind] = by_stage
+    for plant, by_stage in wanted.items():
+        errors = {
+            stage: {
+                task.name: task.error(read(runs[by_task[task.name].name].bag)) for task in tasks()
+            }
+            for stage, by_task in by_stage.items()
+        }
+        found[plant] = {
+            stage: {name: float(np.max(np.abs(e))) for name, (_, e) in by_task.items()}
+            for stage, by_task in errors.items()
+        }
+        sections.append(page(plant, errors, found[plant], out))
     return found, sections
 
 
-def main() -> int:
-    """Run the command line: write metrics.json and report.html, print the tables."""
-    parser = argparse.ArgumentParser(
-        prog="python -m piezo_sim.experiment.sensorless", description=__doc__.splitlines()[0]
+def page(
+    plant: str,
+    errors: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    largest: Mapping[str, Mapping[str, float]],
+    out: Path,
+) -> Section:
+    """Return table and picture of one plant."""
+    shown = (
+        "step_22degc",
+        "hold_32degc",
+        "hold_22_to_32degc",
+        "1hz_22degc",
+        "1hz_32degc",
+        "50hz_22degc",
     )
-    parser.add_argument("--out", type=Path, default=Path("out/sensorless"))
-    out = parser.parse_args().out
-    found, sections = study()
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "metrics.json").write_text(json.dumps(found, indent=2, ensure_ascii=False))
-    write_html(out / "report.html", "Without a sensor", sections)
-    for section in sections:
-        print_table(Console(), section)
-    return 0
+    panels = {name: {stage: errors[stage][name] for stage in errors} for name in shown}
+    picture = plots.errors(panels, out / f"sensorless_{plant}.png")
+    rows = [
+        [
+            task.name.replace("_", " "),
+            *(f"{by_task[task.name]:.2f}" for by_task in largest.values()),
+        ]
+        for task in tasks()
+    ]
+    caption = "Error of the tip, models added one by one, and beside them under feedback."
+    columns = ["largest error [%]", *largest]
+    return Section(f"Without a sensor, plant {plant}", TEXT, [(picture, caption)], columns, rows)
+
+
+def work(
+    arguments: argparse.Namespace, out: Path, console: Console
+) -> tuple[dict[str, Any], Sequence[Section]]:
+    """Do the study into the folder `out`."""
+    with Progress(console=console) as progress:
+        return study(out, "finger", progress, not arguments.engine)
+
+
+def main() -> int:
+    """Run the command line and return its exit code."""
+    parser = command_line.parser("piezo_sim.experiment.sensorless", __doc__)
+    parser.add_argument("--engine", action="store_true", help="all on the engine, without nodes")
+    return command_line.run(parser.parse_args(), "Without a sensor", work)
 
 
 if __name__ == "__main__":
