@@ -395,7 +395,7 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
         (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
         (("--duration", -1.0), "'duration' is -1.0, must be a number above 0.0"),
         (("--duration", math.inf), "'duration' is inf, must be a number above 0.0"),
-        (("--params", "/nowhere"), "params: /nowhere is no folder"),
+        (("--params", tmp_path / "nowhere"), "nowhere is no folder"),
         (("--params", tmp_path), "has none of feedforward.yaml, "),
         (("--temperature", 400.0), "base_degc"),
     ):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From recordings of a finger to the parameters its nodes load.
 
-Reads rosbag2 folders and text files, and writes into one folder (--out), step by step:
+Reads rosbag2 folders, text files and those of other programs; a row of a table has a deflection beside the voltage
+that was held until then (a delay of whole rows is found). Writes into one folder (--out), step by step:
 feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.yaml (`hysteresis`,
 `dynamics`, `stiffness`, `drift`), a picture and the fit's figures (JSON) of each step. After `hysteresis
 --model classical`, `dynamics` and `drift`, feedforward.yaml has all that `compensator: sensorless` needs.
