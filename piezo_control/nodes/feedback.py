@@ -14,9 +14,8 @@ loop runs, with the command where it was. With `force_control`, in place of the 
 reference as long as the tip pushes with no more than the profile's `max_force` and its own `touch.force_limit`,
 and holds that force where something is in the way (:mod:`piezo_control.touch`). With `preview_band` profiles and
 waveforms are followed without lag, as far as the controller's band goes (:mod:`piezo_control.design.preview`).
-Running free, nothing is
-answered before the deflections come at the sample time that the controller was made for, and a loop that falls
-behind ends in a fault.
+Running free, nothing is answered before the deflections come at the sample time that the controller was made for,
+and a loop that falls behind ends in a fault.
 """
 
 from __future__ import annotations

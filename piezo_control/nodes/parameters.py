@@ -7,13 +7,7 @@ from dataclasses import dataclass, replace
 
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import (
-    ParameterError,
-    build,
-    group,
-    load,
-    parameter,
-)
+from piezo_control.parameters import ParameterError, build, group, load, parameter
 from piezo_control.safety import SafetyParameters
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.servo.parameters import ServoParameters

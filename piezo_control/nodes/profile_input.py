@@ -38,7 +38,7 @@ class ProfileInput:
     """Subscribes TOPIC (Sample), TOPIC_profile and TOPIC_waveform; ``input[k]`` is the value at sample k.
 
     A profile is kept for who joins later; a waveform moves the fingers that are there when it is sent.
-    `on_change()` is called with every new signal. Where it `says` so, TOPIC_followed_profile and
+    `on_change()` is called after every new signal. Where it `says` so, TOPIC_followed_profile and
     TOPIC_followed_waveform are what is followed.
     """
 
@@ -90,6 +90,7 @@ class ProfileInput:
         if not (self.is_known or math.isnan(value) or value == self[0]):
             self._sampled = SampledSignal(Profile([0.0], [value]), self._sampled.sample_time)
             self._is_new = True
+            self._on_change()
 
     def say(self, header: Header) -> None:
         """Publish what is followed from the sample with this header on, if it is new or the run is."""
