@@ -77,6 +77,7 @@ setup(
     extras_require={
         "cluster": ["distributed"],  # `monte_carlo --scheduler`
         "formats": ["fastparquet", "h5py", "npTDMS", "openpyxl"],  # recordings of other instruments
+        "panel": ["bokeh"],  # `panel`
         "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
         "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
         "test": [
@@ -108,6 +109,7 @@ setup(
             "commission = piezo_control.start:commission",
             "udp_finger = piezo_sim.start:udp_finger",
             "gripper = piezo_control.start:gripper",
+            "panel = piezo_control.start:panel",
             "gripper_stack = piezo_sim.start:gripper_stack",
             "monte_carlo = piezo_sim.start:monte_carlo",
         ],

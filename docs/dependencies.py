@@ -8,7 +8,13 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-FILES = ("requirements/common.txt", "requirements/wheels.txt", "docs/requirements.txt")
+FILES = (
+    "requirements/common.txt",
+    "requirements/wheels.txt",
+    "requirements/panel.txt",
+    "requirements/browser.txt",
+    "docs/requirements.txt",
+)
 LONGEST = 60  # characters of a licence; some packages have the whole text there
 HEAD = """# Dependencies
 

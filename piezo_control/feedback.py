@@ -122,6 +122,13 @@ class FeedbackParameters:
         return np.reshape(values, shape) if values else np.zeros(shape)
 
 
+def known_controllers(folders: Sequence[Path] = ()) -> list[str]:
+    """Return the names of the controllers that are in some folders; those that are shipped, where none is named."""
+    places = folders or [shared_folder() / "params"]
+    files = sorted(path for place in places for path in place.glob("feedback_*.yaml"))
+    return list(dict.fromkeys(path.stem.removeprefix("feedback_") for path in files))
+
+
 def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters:
     """Return the controller called `name`, from `folder` or the shipped ones, or that of a parameter file.
 
@@ -134,8 +141,7 @@ def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters
     except OSError:  # a name that no file can have
         path = None
     if path is None:
-        files = sorted(path for place in folders for path in place.glob("feedback_*.yaml"))
-        known = ", ".join(dict.fromkeys(path.stem.removeprefix("feedback_") for path in files))
+        known = ", ".join(known_controllers(folders))
         raise ParameterError(f"controller '{name}' is no file, and not one of the known {known}")
     return build(FeedbackParameters, load(path, "feedback"), str(path))
 

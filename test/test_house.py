@@ -36,7 +36,7 @@ LEVELS = [
     },
     {"shaping", "feedforward", "sensorless", "thermometer", "design"},
     {"identification", "servo"},
-    {"nodes", "export"},
+    {"nodes", "export", "panel"},
     {"plant", "temperature"},
     {"engine", "sim_nodes", "driver", "udp_finger"},
     {"experiment"},

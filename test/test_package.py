@@ -29,6 +29,7 @@ EXECUTABLES = {
     "synthesize",
     "monte_carlo",
     "gripper",
+    "panel",
     "gripper_stack",
     "servo",
     "commission",

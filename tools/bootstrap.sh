@@ -67,7 +67,8 @@ install_pins() {
   say "installing the pinned packages into .venv ($(.venv/bin/python --version), $underlay; a minute or so, see $log)"
   mkdir -p log
   if ! .venv/bin/python -m pip install --no-input --disable-pip-version-check --no-deps \
-      --requirement "requirements/$underlay.txt" > "$log" 2>&1; then
+      --requirement "requirements/$underlay.txt" ${browser:+--requirement requirements/browser.txt} \
+      > "$log" 2>&1; then
     if grep -qE 'Retrying|from versions: none' "$log"; then
       fail "no package registry reachable: check the network, or pip's index-url and proxy (see $log)"
     fi
@@ -125,7 +126,8 @@ if [ -f .venv/place ] && [ "$(<.venv/place)" != "$place" ]; then
 fi
 
 # Editing a module needs no build: install/ links to it. A new file in params/, launch/ or description/ does, or a new Python package.
-pins=$(cat requirements/*.txt | fingerprint)
+browser=$(command -v chromium || true)  # where there is one, its test is run
+pins=$({ cat requirements/*.txt; echo "$browser"; } | fingerprint)
 sources=$({
   echo "$place $pins"
   cat package.xml setup.py setup.cfg tools/*.bash tools/*.cmake

@@ -17,7 +17,6 @@ asked for, so looking at a loop of thousands of samples a second costs neither i
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 import threading
@@ -45,12 +44,14 @@ from rclpy.task import Future
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
+from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.gripper import GripperParameters, check_goal, reach
+from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput, waveform_message
 from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.nodes.spin import LONGEST_WAIT
-from piezo_control.parameters import build
+from piezo_control.parameters import build, declarations, flatten
 from piezo_control.safety import LARGEST_DEFLECTION
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.action import Grip
@@ -60,12 +61,16 @@ from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 LOOK_PERIOD = 0.02  # s, between two looks at something that is waited for
 ASK_AGAIN = 0.5  # s, for what can be asked more than once
 FIRST_MESSAGE = 0.3  # s in which the first message of a topic comes, if it does
+SILENCE = 2.0  # s; a state comes every second at least
 LEAD_TIME = 0.1  # s of the finger's time from sending a waveform to its start
+HOMING = {"frequency": 5.0, "duration": 2.0}  # Hz and s of the decaying sine
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 STATE_TYPE = "piezo_gripper_msgs/msg/FingerState"
 CHANGE_STATE = "/change_state"
 FOLLOWERS = ("feedback", "servo")
 """Nodes that follow a reference."""
+LIMITERS = ("servo", "feedforward")
+"""Nodes that keep the voltage within its limits."""
 STOPPERS = ("servo", "cantilever", "feedforward")
 """Nodes that bring the voltage to rest when they are deactivated; the first that is there does."""
 TRANSITIONS = {
@@ -83,6 +88,8 @@ class ClientError(RuntimeError):
 class Reading(NamedTuple):
     """The newest of a finger's signals, NaN for what nobody publishes."""
 
+    number: float
+    """Of the newest deflection; 0 is the first since the finger was activated."""
     time: float
     """s since sample 0, in the finger's own time."""
     reference: float
@@ -99,11 +106,38 @@ class Reading(NamedTuple):
     """N"""
 
 
+class Setup(NamedTuple):
+    """What the nodes of a finger are set to: its controller and the limits that act on it."""
+
+    controller: str
+    """Shipped name, path of a file, or the name of a design."""
+    is_closed: bool
+    """Whether a controller closes the loop."""
+    command_low: float
+    """m"""
+    command_high: float
+    """m"""
+    voltage_low: float
+    """V"""
+    voltage_high: float
+    """V"""
+    slew_limit: float
+    """V/s"""
+    force_limit: float
+    """N; NaN for a finger that feels none."""
+
+
+def own(parameters: type, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of a node's `values` that are fields of its dataclass."""
+    known = declarations(parameters)
+    return {name: value for name, value in values.items() if name in known}
+
+
 class Newest:
     """The newest message of a topic, taken when it is asked for; belongs to a node that nobody spins.
 
     It subscribes when it is asked for the first time, as every sample costs whoever receives and sends it, and then
-    waits for a moment for the first of a topic that somebody publishes.
+    waits for a moment for the first of a topic that somebody publishes. Any thread may ask.
     """
 
     def __init__(self, node: Node, kind: type, topic: str) -> None:
@@ -111,19 +145,21 @@ class Newest:
         self._subscribe = partial(node.create_subscription, kind, topic, lambda _: None, LATEST)
         self._subscription: Any = None
         self._last: Any = None
+        self._one_at_a_time = threading.Lock()
 
     def __call__(self) -> Any:
         """Return the message; None before the first."""
-        if self._subscription is None:
-            self._subscription = self._subscribe()
-            end = time.monotonic() + FIRST_MESSAGE
-            topic = self._subscription.topic_name
-            while not self._take() and self._node.count_publishers(topic):
-                if time.monotonic() > end:
-                    break
-                time.sleep(LOOK_PERIOD)
-        self._take()
-        return self._last
+        with self._one_at_a_time:
+            if self._subscription is None:
+                self._subscription = self._subscribe()
+                end = time.monotonic() + FIRST_MESSAGE
+                topic = self._subscription.topic_name
+                while not self._take() and self._node.count_publishers(topic):
+                    if time.monotonic() > end:
+                        break
+                    time.sleep(LOOK_PERIOD)
+            self._take()
+            return self._last
 
     def _take(self) -> bool:
         """Take the message that has come, if one has."""
@@ -145,6 +181,8 @@ class Ros:
         self._executor = executor
         self.watcher = watcher
         self.timeout = timeout
+        self.closing = threading.Event()
+        """Nothing is waited for any more."""
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         """The newest of each node, by its full name."""
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
@@ -214,6 +252,10 @@ class Ros:
         if not result.successful:
             raise ClientError(f"'{node}' refuses: {result.reason}")
 
+    def grippers(self) -> list[str]:
+        """Return the namespaces of the grippers that are there."""
+        return [n.removesuffix("/gripper") or "/" for n in self.nodes() if n.endswith("/gripper")]
+
     def gripper(self, namespace: str = "") -> Gripper:
         """Return the gripper in a namespace."""
         return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
@@ -254,21 +296,29 @@ class Ros:
                 answered.wait(ASK_AGAIN)
         finally:
             self.node.destroy_client(client)
+    def trigger(self, service: str) -> str:
+        """Ask a service without arguments and return what it says; ClientError if it refuses."""
+        answer = self.call(Trigger, service, Trigger.Request())
+        if not answer.success:
+            raise ClientError(f"'{service}' refuses: {answer.message}")
+        return answer.message
 
     def result(self, future: Future, who: str, timeout: float = 0.0) -> Any:
         """Return what a future comes to."""
         limit = timeout or self.timeout
+        end = time.monotonic() + limit
         done = threading.Event()
         future.add_done_callback(lambda _: done.set())
-        if not done.wait(limit):
-            raise ClientError(f"'{who}' has not answered for {limit:g} s")
+        while not done.wait(LOOK_PERIOD):
+            if self.closing.is_set() or time.monotonic() > end:
+                raise ClientError(f"'{who}' has not answered for {limit:g} s")
         return future.result()
 
     def wait(self, condition: Callable[[], bool], otherwise: Callable[[], str]) -> None:
         """Return when `condition` holds; after the time limit ClientError with the words of `otherwise`."""
         end = time.monotonic() + self.timeout
         while not condition():
-            if time.monotonic() > end:
+            if self.closing.is_set() or time.monotonic() > end:
                 raise ClientError(f"{otherwise()} (waited {self.timeout:g} s)")
             time.sleep(LOOK_PERIOD)
 
@@ -289,9 +339,7 @@ class Gripper:
     def __init__(self, ros: Ros, node: str) -> None:
         self.ros = ros
         self.node = node
-        values = ros.parameters(node)
-        known = {f.name for f in dataclasses.fields(GripperParameters)}
-        self.law = build(GripperParameters, {n: v for n, v in values.items() if n in known}, node)
+        self.law = build(GripperParameters, own(GripperParameters, ros.parameters(node)), node)
         """Its geometry and limits."""
         # An action client stays: one that is destroyed while the thread waits for it ends the thread.
         self._grip = ActionClient(ros.node, Grip, f"{node.rpartition('/')[0]}/grip")
@@ -354,6 +402,14 @@ class Gripper:
             return "silent on '/diagnostics'"
         return "" if status.level == DiagnosticStatus.OK else status.message
 
+    def home(self) -> str:
+        """Begin to go to the opening at rest; return what the gripper says."""
+        return self.ros.trigger(f"{self.node}/home")
+
+    def stop(self) -> str:
+        """Let the fingers hold where they are; return what the gripper says."""
+        return self.ros.trigger(f"{self.node}/stop")
+
 
 class Finger:
     """A finger, simulated or real, in a namespace such as '/finger'; made by :meth:`Ros.finger`."""
@@ -364,6 +420,7 @@ class Finger:
         self.prefix = namespace.rstrip("/") + "/"
         self.state: FingerState | None = None
         """The newest state; None before the first."""
+        self._heard = -math.inf
         node, watcher = ros.node, ros.watcher
         node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
         # Which frequencies its loop can follow the finger says, so here any sample time will do.
@@ -391,6 +448,7 @@ class Finger:
         elapsed = deflection.number * deflection.period if deflection else nan
         values = {name: getattr(take(), "value", nan) for name, take in self._samples.items()}
         return Reading(
+            number=deflection.number if deflection else nan,
             time=elapsed,
             reference=self._reference_at(elapsed),
             temperature=getattr(
@@ -405,6 +463,10 @@ class Finger:
         if self._reference.is_known:
             return float(self._reference.signal.at(elapsed))
         return self.state.reference if self.state else math.nan
+    @property
+    def is_silent(self) -> bool:
+        """Whether no state came for so long that the finger is taken for gone."""
+        return time.monotonic() - self._heard > SILENCE
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
         """Return when `condition` holds; ClientError with the finger's state when it does not in time."""
@@ -415,6 +477,9 @@ class Finger:
         if self.state is None:
             others = ", ".join(self.ros.fingers()) or "none"
             return f"silent: nothing on '{self.prefix}state'; fingers that are there: {others}"
+        if self.is_silent:
+            silence = time.monotonic() - self._heard
+            return f"silent: nothing on '{self.prefix}state' for {silence:.0f} s"
         text = f": {self.state.text}" if self.state.text else ""
         return f"{PHASES[self.state.phase]}{text}"
 
@@ -431,6 +496,13 @@ class Finger:
     def zero(self) -> None:
         """Let the finger go to a deflection of 0 and stay there."""
         self.set(0.0)
+
+    def home(self) -> None:
+        """Let the finger forget what was before: a sine over all its range that decays to the middle of it."""
+        setup = self.setup()
+        middle = 0.5 * (setup.command_low + setup.command_high)
+        half = setup.command_high - middle
+        self.wave(Waveform("decaying_sine", amplitude=half, offset=middle, **HOMING))
 
     def wave(self, waveform: Waveform) -> None:
         """Let the finger follow a waveform (m), from a tenth of a second ahead; its own `start` is not used.
@@ -485,9 +557,40 @@ class Finger:
         """Let another controller take over: a shipped name, the path of a file, or 'none': open loop."""
         self.ros.set_parameters(self.node(*FOLLOWERS), {"controller_file": controller})
 
+    def setup(self) -> Setup:
+        """Return what its nodes are set to.
+
+        Raises ParameterError where a servo has that from files which are not on this machine.
+        """
+        follower, limiter = self.node(*FOLLOWERS), self.node(*LIMITERS)
+        values = self.ros.parameters(follower)
+        if follower == limiter:
+            servo = build(ServoNodeParameters, own(ServoNodeParameters, values), follower)
+            feedback = flatten(successor(servo.controller_file, FeedbackParameters()))
+            feedforward = flatten(read_feedforward(servo))
+        else:
+            feedback, feedforward = values, self.ros.parameters(limiter)
+        return Setup(
+            controller=values["controller_file"] or feedback["name"],
+            is_closed=feedback["controller"] != "none",
+            command_low=feedback["command_low"],
+            command_high=feedback["command_high"],
+            voltage_low=feedforward["voltage_low"],
+            voltage_high=feedforward["voltage_high"],
+            slew_limit=feedforward["slew_limit"],
+            force_limit=feedback["touch.force_limit"]
+            if feedback.get("force_control")
+            else math.nan,
+        )
+
     def stop(self) -> None:
-        """Bring the voltage to rest, where it stays until `start`."""
-        self.ros.lifecycle(self.node(*STOPPERS), "deactivate")
+        """Bring the voltage to rest, where it stays until `start`; a finger that is stopped stays so."""
+        node = self.node(*STOPPERS)
+        try:
+            self.ros.lifecycle(node, "deactivate")
+        except ClientError:
+            if self.ros.lifecycle(node) != "inactive":
+                raise
 
     def start(self) -> None:
         """Let a stopped finger run again; its reference is that of before."""
@@ -531,6 +634,7 @@ class Finger:
         self.ros.lifecycle(recorder, "cleanup")
 
     def _on_state(self, state: FingerState) -> None:
+        self._heard = time.monotonic()
         self.state = state
 
 
@@ -550,19 +654,18 @@ def connect(timeout: float = 10.0) -> Iterator[Ros]:
     )
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-
-    done = threading.Event()
+    ros = Ros(node, watcher, executor, timeout)
 
     def spin() -> None:
-        while not done.is_set():
+        while not ros.closing.is_set():
             executor.spin_once(timeout_sec=LONGEST_WAIT)
 
     thread = threading.Thread(target=spin, name="client", daemon=True)
     thread.start()
     try:
-        yield Ros(node, watcher, executor, timeout)
+        yield ros
     finally:
-        done.set()
+        ros.closing.set()
         thread.join()
         executor.shutdown()
         watcher.destroy_node()

@@ -18,21 +18,19 @@ from functools import partial
 from typing import Any
 
 import yaml
-from diagnostic_msgs.msg import DiagnosticStatus
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from piezo_control.nodes.client import TRANSITIONS, ClientError, Finger, Ros, connect
+from piezo_control.nodes.overview import ROWS, complaints, ended, in_order
 from piezo_control.waveform import SHAPES, Waveform
-from piezo_gripper_msgs.msg import FingerState
 
 WATCH_PERIOD = 0.1  # s
 DISCOVERY = 1.0  # s, in which the others become known after the first
 TRACE = 40  # readings
 BARS = "▁▂▃▄▅▆▇█"
-IN_ORDER = (FingerState.WAITING, FingerState.RUNNING, FingerState.FINISHED)
 
 
 def main() -> int:
@@ -93,7 +91,7 @@ def state(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     console.print(overview(chosen))
     for line in complaints(ros):
         console.print(line, markup=False, highlight=False)
-    return int(any(f.state is None or f.state.phase not in IN_ORDER for f in chosen))
+    return int(not all(in_order(finger) for finger in chosen))
 
 
 def watch(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
@@ -161,10 +159,7 @@ def grip(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     a = arguments
     goal = (a.um * 1e-6, a.speed_um_s * 1e-6, a.force_mn * 1e-3)
     result = ros.gripper(a.gripper).move(*goal, timeout=a.seconds)
-    how = "there" if result.reached_goal else "stopped before" if result.stalled else "given up"
-    console.print(
-        f"{how}: opening {result.opening * 1e6:.2f} µm, force {result.force * 1e3:.3f} mN"
-    )
+    console.print(ended(result))
     # Closing, a gripper that stops at the force has done what it should.
     return int(not result.reached_goal and not (result.stalled and result.force > 0.0))
 
@@ -220,32 +215,6 @@ def overview(chosen: list[Finger], traces: dict[str, deque[float]] | None = None
     return table
 
 
-def of_state(show: Any) -> Any:
-    """Return a cell that shows something of the finger's state."""
-    return lambda finger, _: show(finger.state) if finger.state else "-"
-
-
-ROWS: dict[str, Any] = {
-    "does": lambda finger, _: finger.words(),
-    "time [s]": lambda _, r: figure(r.time, 1.0, 2),
-    "reference [µm]": lambda _, r: figure(r.reference, 1e6, 3),
-    "deflection [µm]": lambda _, r: figure(r.deflection, 1e6, 3),
-    "command [µm]": lambda _, r: figure(r.command, 1e6, 3),
-    "voltage [V]": lambda _, r: figure(r.voltage, 1.0, 2),
-    "tip force [mN]": lambda _, r: figure(r.tip_force, 1e3, 3),
-    "temperature [°C]": lambda _, r: figure(r.temperature, 1.0, 1),
-    "at a limit [samples]": of_state(lambda s: str(s.clipped)),
-    "rate [Hz]": of_state(lambda s: figure(s.rate or math.nan, 1.0, 0)),
-    "jitter [µs]": of_state(lambda s: figure(s.jitter or math.nan, 1e6, 0)),
-    "on target": of_state(lambda s: "yes" if s.on_target else "-"),
-}
-
-
-def figure(value: float, scale: float, digits: int) -> str:
-    """Return a number as text."""
-    return "-" if math.isnan(value) else f"{value * scale:.{digits}f}"
-
-
 def sparkline(values: deque[float]) -> str:
     """Return values as a row of bars between the smallest and the largest."""
     known = [v for v in values if not math.isnan(v)]
@@ -253,15 +222,6 @@ def sparkline(values: deque[float]) -> str:
         return "-"
     low, span = min(known), (max(known) - min(known)) or 1.0
     return "".join(BARS[int((v - low) / span * (len(BARS) - 1))] for v in known)
-
-
-def complaints(ros: Ros) -> list[str]:
-    """Return what is wrong with any node, in its own words."""
-    return [
-        f"{name}: {status.message}"
-        for name, status in sorted(ros.diagnostics.items())
-        if status.level != DiagnosticStatus.OK
-    ]
 
 
 # --- arguments ----------------------------------------------------------------------------------------
@@ -316,6 +276,7 @@ def parse(words: list[str]) -> argparse.Namespace:
         help="then the offset; a sweep and a decaying sine need it",
     )  # fmt: skip
     simple("zero", "go to a deflection of 0")
+    simple("home", "forget what was before: a sine over the whole range that decays")
     simple("stop", "bring the voltage to rest, until 'start'")
     simple("start", "let a stopped finger run again")
     command("reset", reset, "leave latched faults")

@@ -1,0 +1,510 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a panel: what it keeps and draws, and all of it in a real browser in front of a running gripper."""
+
+import http.client
+import math
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from ament_index_python.packages import get_package_prefix
+from bokeh.events import ButtonClick
+
+from piezo_control.nodes.client import connect
+from piezo_control.panel.cards import Card, Gauge, Message, render
+from piezo_control.panel.controls import Controls, number
+from piezo_control.panel.history import History
+from piezo_control.panel.traces import LOOKS, MOST, SIGNALS, Traces, known
+from piezo_control.recording.reader import open_bag
+from piezo_control.waveform import SHAPES
+from piezo_gripper_msgs.msg import FingerState
+
+EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
+TIMEOUT = 180.0  # s, generous: the tests wait on conditions
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
+
+
+# --- without a browser --------------------------------------------------------------------------------
+
+
+def filled(count, **signals):
+    """Return a history of `count` looks, in which signals have the values that are functions of the time."""
+    history = History(SIGNALS, 600 * LOOKS)
+    for index in range(count):
+        clock = index / LOOKS
+        values = {"clock": clock} | {name: signal(clock) for name, signal in signals.items()}
+        history.append([values.get(signal, math.nan) for signal in SIGNALS])
+    return history
+
+
+def test_history_keeps_the_newest_rows_and_leaves_out_the_same_ones_however_it_is_asked():
+    history = History(("clock", "number"), 100)
+    for index in range(250):
+        history.append((0.02 * index, 7.0 * index))
+    np.testing.assert_array_equal(history.since(0)["number"], 7.0 * np.arange(150, 250))
+    whole = history.since(0, step=4)["number"]
+    parts = [history.since(first, 4)["number"] for first in (150, 203)]
+    np.testing.assert_array_equal(whole, 7.0 * np.arange(152, 250, 4))
+    np.testing.assert_array_equal(parts[1], whole[whole >= 7.0 * 203])
+    assert history.rate("number", "clock", 50) == pytest.approx(350.0)
+    assert math.isnan(history.rate("number", "clock", 100))
+
+
+def test_rate_is_unknown_over_a_restart():
+    history = filled(60, number=lambda t: (1000.0 * t) % 900.0)
+    assert math.isnan(history.rate("number", "clock", 20))
+    assert history.rate("number", "clock", 5) == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize("text", ["", "abc", "1,5", "nan", "inf", "1e999"])
+def test_a_field_that_holds_no_number_says_what_is_in_it_and_what_must_be(text):
+    with pytest.raises(ValueError) as refusal:
+        number(text, "the amplitude", "µm")
+    assert str(refusal.value) == (f"the amplitude is '{text}', must be a number in µm, such as 2.5")
+
+
+def test_gauge():
+    gauge = Gauge("Voltage", "V", 20.0, -40.0, 40.0)
+    assert gauge.share == 0.75 and not gauge.is_at_limit
+    assert Gauge("Voltage", "V", 40.1, -40.0, 40.0).is_at_limit
+    assert not Gauge("Voltage", "V", math.nan, -40.0, 40.0).is_at_limit
+
+
+def test_words_of_nodes_are_text_on_the_page():
+    card = Card("/finger", "#000", "bad", "<img src=x>", "", [Gauge("Voltage", "V", 1.0)], [])
+    assert "<img" not in render("cards", cards=[card])
+    assert "<img" not in render("messages", messages=[Message("1", "2", "<img src=x>", True)])
+    assert "<img" not in render("complaints", complaints=["<img src=x>"])
+
+
+def test_traces_go_on_where_they_were_and_are_thinned_to_what_a_screen_shows():
+    history = filled(1200, deflection=lambda t: 1e-6 * t)
+    assert known([history]) == ["position"]
+    traces = Traces({"/finger": history})
+    (source,) = {line.data_source for line in traces.figures["position"].renderers[:1]}
+    assert len(source.data["clock"]) == 10 * LOOKS
+    np.testing.assert_allclose(source.data["deflection"], np.arange(700, 1200) / LOOKS)
+    traces.show("10 min")
+    np.testing.assert_allclose(source.data["deflection"], np.arange(0, 1200, 20) / LOOKS)
+    traces.is_frozen = True
+    history.append([24.0, *[math.nan] * (len(SIGNALS) - 1)])
+    traces.go_on()
+    assert len(source.data["clock"]) == 60
+    traces.is_frozen = False
+    traces.go_on()
+    assert len(source.data["clock"]) == 61
+    assert 600 * LOOKS / 20 == MOST
+
+
+class Recorded:
+    """A bench whose fingers and gripper take down what they are asked for."""
+
+    def __init__(self):
+        self.asked, self.refused = [], []
+        self.fingers = {
+            name: SimpleNamespace(
+                namespace=name,
+                **{what: self._taker(name, what) for what in ("set", "wave", "home", "control")},
+            )
+            for name in ("/left", "/right")
+        }
+
+    def _taker(self, *who):
+        return lambda *values: self.asked.append((*who, *values))
+
+    def reach(self):
+        return -20e-6, 22e-6
+
+    def ask(self, what, act):
+        act()
+
+    def refuse(self, what, why):
+        self.refused.append((what, why))
+
+    def stop(self):
+        self.asked.append("stop")
+
+
+@pytest.fixture
+def recorded():
+    bench = Recorded()
+    controls = Controls(bench)
+    bench.widgets = {widget.name: widget for widget in controls.widgets}
+
+    def press(name):
+        button = bench.widgets[name]
+        button._trigger_event(ButtonClick(button))
+
+    bench.press = press
+    return bench
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_every_waveform_can_be_asked_for_with_its_fields_as_they_are(recorded, shape):
+    recorded.widgets["shape"].value = shape
+    recorded.widgets["amplitude"].value_input = "4"
+    recorded.widgets["offset"].value_input = "-2.5"
+    recorded.widgets["choice"].active = 2
+    recorded.press("wave")
+    assert recorded.refused == []
+    (left, _, wave), (right, _, same) = recorded.asked
+    assert (left, right) == ("/left", "/right") and wave == same
+    assert (wave.shape, wave.amplitude, wave.offset) == (
+        shape,
+        *map(pytest.approx, (4e-6, -2.5e-6)),
+    )
+    # The longest that a shape without an end of its own goes on is given by its field.
+    assert wave.duration == (10.0 if shape in ("sweep", "decaying_sine") else 0.0)
+    assert recorded.widgets["end_frequency"].visible == (shape == "sweep")
+
+
+def test_steps_go_on_from_what_is_in_the_field(recorded):
+    recorded.widgets["set_point"].value_input = "3"
+    recorded.press("step3")
+    recorded.press("step1")
+    assert [value for _, _, value in recorded.asked] == pytest.approx([4e-6, 3.9e-6])
+    recorded.widgets["set_point"].value_input = "three"
+    recorded.press("step3")
+    assert recorded.refused == [
+        ("+1", "the set-point is 'three', must be a number in µm, such as 2.5")
+    ]
+
+
+# --- in a browser -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium on this machine (apt install chromium)")
+    playwright = pytest.importorskip("playwright.sync_api", reason="installed where chromium is")
+    with playwright.sync_playwright() as p:
+        chromium = p.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield chromium
+        chromium.close()
+
+
+class Page:
+    """A page of a panel in a browser, by the names of its parts."""
+
+    def __init__(self, context, address):
+        self.errors, self.elsewhere = [], []
+        self.page = context.new_page()
+        self.page.set_default_timeout(1e3 * TIMEOUT)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", self._request)
+        self.address = address
+        self.page.goto(address)
+
+    def _request(self, request):
+        if not request.url.startswith((self.address, "data:", self.address.replace("http", "ws"))):
+            self.elsewhere.append(request.url)
+
+    def press(self, name):
+        self.page.locator(f".{name} button").click()
+
+    def fill(self, name, text):
+        self.page.locator(f".{name} input").fill(text)
+
+    def choose(self, name):
+        self.page.locator(".choice button", has_text=name).click()
+
+    def shows(self, text, where="body"):
+        """Wait until a part of the page shows a text."""
+        self.page.locator(where).filter(has_text=text).first.wait_for()
+
+    def trace(self, finger):
+        """Return what is drawn of a finger's signals, in their units, and the times in s."""
+        columns = self.page.evaluate(
+            f"""() => Object.entries(Bokeh.documents[0].get_model_by_name("source{finger}").data)
+                .map(([name, values]) => [name, Array.from(values)])"""
+        )
+        drawn = {name: np.array(values, dtype=float) for name, values in columns}
+        return drawn | {"clock": drawn["clock"] * 1e-3}
+
+
+class Panel:
+    """A panel in a process of its own; what it says is in `log`."""
+
+    def __init__(self, folder, *arguments):
+        self.log = folder / "panel.log"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [EXECUTABLES / "panel", "--port", "0", "--timeout", "20", *arguments],
+                stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
+            )  # fmt: skip
+        self.address = self.process.stdout.readline().split()[1]
+
+    def end(self):
+        self.process.send_signal(signal.SIGTERM)
+        assert self.process.wait(TIMEOUT) == 0
+        # Bokeh itself may complain of a page that was closed while it was opened.
+        assert "piezo_control" not in self.log.read_text()
+
+
+@pytest.fixture(scope="module")
+def panel(browser, tmp_path_factory):
+    """A panel with controls, a page of it that was opened before there was any finger, and a gripper."""
+    folder = tmp_path_factory.mktemp("panel")
+    running = Panel(folder, "--control")
+    stack = None
+    try:
+        running.page = Page(browser.new_context(), running.address)
+        running.page.shows("No finger is running in this ROS domain")
+        with (folder / "stack.log").open("wb") as log:
+            # Simulated fingers take all there is; the page comes first.
+            stack = subprocess.Popen(
+                ["nice", "-n", "5", EXECUTABLES / "gripper_stack"],
+                cwd=folder, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+            )  # fmt: skip
+        for part in ("/left", "/right", "closed loop, robust"):
+            running.page.shows(part, ".cards")
+        running.page.shows("Gripper", "fieldset")
+        running.folder = folder
+        yield running
+        assert running.page.errors == []
+        assert running.page.elsewhere == []
+    finally:
+        if stack:
+            os.killpg(stack.pid, signal.SIGTERM)
+            stack.wait(TIMEOUT)
+        running.end()
+
+
+@pytest.fixture(scope="module")
+def ros(panel):
+    with connect(TIMEOUT) as connection:
+        yield connection
+
+
+@pytest.fixture
+def left(ros):
+    finger = ros.finger("left")
+    finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+    yield finger
+    finger.zero()
+    finger.wait_for(near(finger, 0.0))
+
+
+@pytest.fixture
+def page(panel):
+    panel.page.choose("/left")
+    return panel.page
+
+
+def near(finger, target):
+    return lambda: abs(finger.newest().deflection - target) < 0.1e-6
+
+
+def test_set_point_moves_the_finger_and_its_trace(page, left):
+    page.fill("set_point", "6.5")
+    page.press("go")
+    left.wait_for(near(left, 6.5e-6))
+    page.shows("/left: set-point 6.5 µm: done", ".messages")
+    page.page.wait_for_function(
+        """() => Math.abs(
+            Bokeh.documents[0].get_model_by_name("source/left").data.deflection.at(-1) - 6.5) < 0.1"""
+    )
+    page.press("zero")
+    left.wait_for(near(left, 0.0))
+
+
+def test_traces_have_more_than_twenty_samples_a_second_of_a_waveform(page, left):
+    page.fill("amplitude", "5")
+    page.fill("frequency", "2")
+    page.press("wave")
+    page.page.wait_for_function(
+        """() => {
+            const drawn = Bokeh.documents[0].get_model_by_name("source/left").data.deflection
+            return Math.max(...Array.from(drawn).filter(Number.isFinite)) > 4.5
+        }"""
+    )
+    drawn = page.trace("/left")
+    clock, deflection, reference = (drawn[n] for n in ("clock", "deflection", "reference"))
+    # In the best second, as what else runs on the machine has its share, too.
+    in_a_second = np.searchsorted(clock, clock + 1.0) - np.arange(len(clock))
+    assert max(in_a_second) > 20
+    assert np.nanmax(deflection) > 4.5 and np.nanmax(np.abs(reference)) <= 5.0
+    # `robust` settles within 4 ms, in which this sine moves by 0.25 µm.
+    np.testing.assert_allclose(deflection[-50:], reference[-50:], atol=0.5)
+    page.press("end_wave")
+    left.wait_for(near(left, 0.0))
+
+
+@pytest.mark.parametrize(
+    "field, text, button, words",
+    [
+        ("set_point", "six", "go", "the set-point is 'six', must be a number in µm"),
+        ("set_point", "20000", "go", "deflection is 0.02 m, must be within ±0.001 m"),
+        ("frequency", "0", "wave", "frequency is 0, must be in (0, 100000] Hz"),
+        ("opening", "500", "move", "refuses this goal"),
+        ("bag", "/dev/null/bag", "record", "refuses to activate"),
+    ],
+)
+def test_what_cannot_be_is_said_in_words(page, left, field, text, button, words):
+    kept = page.page.locator(f".{field} input").input_value()
+    before = left.newest().deflection
+    page.fill(field, text)
+    page.press(button)
+    page.shows(words, ".messages .refused")
+    page.fill(field, kept)
+    assert left.newest().deflection == pytest.approx(before, abs=0.1e-6)
+
+
+def test_loop_opens_and_another_controller_closes_it(page, left):
+    page.press("open_loop")
+    page.shows("open loop", ".cards .loop")
+    assert not left.setup().is_closed
+    page.page.locator(".controller select").select_option("fast")
+    page.press("close_loop")
+    page.shows("closed loop, fast", ".cards .loop")
+    page.page.locator(".controller select").select_option("robust")
+    page.press("close_loop")
+    page.shows("closed loop, robust", ".cards .loop")
+
+
+def test_recording(page, left, panel):
+    bag = panel.folder / "bag"
+    page.fill("bag", str(bag))
+    page.press("record")
+    page.shows(f"recording: into {bag}", ".messages")
+    number = left.newest().number
+    left.wait_for(lambda: left.newest().number > number + 100)
+    page.press("end_record")
+    page.shows("end of the recording: done", ".messages")
+    assert any(topic.endswith("/deflection") for topic in open_bag(bag).topics)
+
+
+def test_gripper(page, ros):
+    page.press("open")
+    page.shows("gripper: open: there: opening 80.00 µm", ".messages")
+    page.fill("opening", "40")
+    page.press("move")
+    page.shows("gripper: opening 40 µm: there", ".messages")
+    page.press("hold")
+    page.shows("gripper: hold: nothing was moving", ".messages")
+
+
+def test_stop_waits_for_nobody(page, ros, left):
+    """Every other command is kept waiting by a recorder that stands still."""
+    recorder = process_of("recorder", "__ns:=/left")
+    os.kill(recorder, signal.SIGSTOP)
+    try:
+        for _ in range(10):
+            page.press("record")
+        page.press("stop")
+        left.wait_for(lambda: left.state.phase == FingerState.IDLE)
+        right = ros.finger("right")
+        right.wait_for(lambda: right.state and right.state.phase == FingerState.IDLE)
+    finally:
+        os.kill(recorder, signal.SIGCONT)
+    assert left.state.voltage == 0.0 and right.state.voltage == 0.0
+    page.shows("idle", ".cards .words")
+    page.choose("both")
+    page.press("start")
+    for finger in (left, right):
+        finger.wait_for(lambda f=finger: f.state.phase == FingerState.RUNNING)
+
+
+def process_of(name, word):
+    """Return the process of an executable of this test's ROS domain that was started with some word."""
+    domain = f"ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "cmdline").read_bytes().decode().split("\0")
+            mine = domain in (folder / "environ").read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if mine and word in words and any(w.endswith(f"/{name}") for w in words):
+            return int(folder.name)
+    raise AssertionError(f"no {name} with {word}")
+
+
+def test_a_fault_is_shown_in_words_and_left_by_reset(page, ros, left):
+    ros.lifecycle("/left/feedback", "deactivate")
+    page.shows("fault: ", ".card.bad .words")
+    page.shows("/left/cantilever", ".complaints")
+    ros.lifecycle("/left/feedback", "activate")
+    page.press("reset")
+    left.wait_for(lambda: left.state.phase == FingerState.RUNNING)
+    page.shows("/left running closed loop", ".card.good")
+
+
+@pytest.fixture(scope="module")
+def onlooker(panel, browser, tmp_path_factory):
+    running = Panel(tmp_path_factory.mktemp("onlooker"))
+    yield running
+    running.end()
+
+
+def test_without_control_there_is_nothing_to_drive_with(onlooker, browser, left):
+    page = Page(browser.new_context(), onlooker.address)
+    page.shows("read-only")
+    page.shows("/left", ".cards")
+    buttons = page.page.get_by_role("button").all_inner_texts()
+    assert set(buttons) <= {"10 s", "1 min", "10 min", "Freeze"}
+    # Nor is there anything in the server that a page made by hand could speak to.
+    names = page.page.evaluate(
+        "() => Array.from(Bokeh.documents[0]._all_models.values()).map(model => model.name)"
+    )
+    assert {"set_point", "stop", "go", "wave"} & set(names) == set()
+    later = page.trace("/left")["clock"][-1] + 1.0
+    page.page.wait_for_function(
+        f"""() => Bokeh.documents[0].get_model_by_name("source/left").data.clock.at(-1) > {1e3 * later}"""
+    )
+    assert page.errors == []
+
+
+def test_pages_of_others_are_not_listened_to(panel):
+    host, _, port = panel.address.removeprefix("http://").strip("/").partition(":")
+    status = {}
+    for origin in (f"http://{host}:{port}", "http://example.com"):
+        connection = http.client.HTTPConnection(host, int(port), timeout=TIMEOUT)
+        connection.request(
+            "GET", "/ws",
+            headers={
+                "Upgrade": "websocket", "Connection": "Upgrade", "Origin": origin,
+                "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "c2l4dGVlbiBieXRlcyEhIQ==",
+            },
+        )  # fmt: skip
+        status[origin] = connection.getresponse().status
+        connection.close()
+    assert status["http://example.com"] == 403
+    assert status[f"http://{host}:{port}"] != 403
+
+
+@pytest.mark.parametrize("width, height", [(1400, 900), (390, 844)], ids=["desktop", "phone"])
+@pytest.mark.parametrize("scheme, dark", [("light", False), ("dark", True)], ids=["light", "dark"])
+def test_page_fits_the_screen_in_light_and_dark(panel, browser, width, height, scheme, dark):
+    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
+    page = Page(context, panel.address)
+    page.shows("closed loop", ".cards")
+    assert page.page.evaluate("document.documentElement.scrollWidth") == width
+    page.page.evaluate("window.scrollTo(0, document.body.scrollHeight)")
+    box = page.page.locator(".stop button").bounding_box()
+    assert 0 <= box["y"] < height - box["height"] and box["x"] + box["width"] <= width
+    paper = page.page.evaluate("getComputedStyle(document.body).backgroundColor")
+    brightness = np.mean([int(part) for part in paper[4:-1].split(",")])
+    assert (brightness < 128) == dark
+    context.close()
+
+
+def test_command_line():
+    for words, code, said in (
+        (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: Cannot assign"),
+        (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
+    ):
+        done = subprocess.run(
+            [EXECUTABLES / "panel", *words], capture_output=True, text=True, timeout=TIMEOUT
+        )
+        assert done.returncode == code
+        assert said in done.stderr and "Traceback" not in done.stderr
