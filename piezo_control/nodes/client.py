@@ -181,6 +181,7 @@ class Ros:
         self._executor = executor
         self.watcher = watcher
         self.timeout = timeout
+        self._parameter_clients: dict[str, AsyncParameterClient] = {}
         self.closing = threading.Event()
         """Nothing is waited for any more."""
         self.diagnostics: dict[str, DiagnosticStatus] = {}
@@ -235,18 +236,23 @@ class Ros:
 
     def parameters(self, node: str) -> dict[str, Any]:
         """Return all parameters of a node."""
-        client = AsyncParameterClient(self.node, node)
-        self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
-        self.meet(node)
+        client = self._parameter_client(node)
         names = sorted(self.result(client.list_parameters([], 0), node).result.names)
         values = self.result(client.get_parameters(names), node).values
         return dict(zip(names, map(parameter_value_to_python, values), strict=True))
 
-    def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
-        """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
-        client = AsyncParameterClient(self.node, node)
+    def _parameter_client(self, node: str) -> AsyncParameterClient:
+        """Return what asks a node for its parameters; it is made once for each."""
+        if node not in self._parameter_clients:
+            self._parameter_clients[node] = AsyncParameterClient(self.node, node)
+        client = self._parameter_clients[node]
         self.wait(client.services_are_ready, lambda: f"'{node}' does not answer")
         self.meet(node)
+        return client
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
+        """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
+        client = self._parameter_client(node)
         changes = [Parameter(name, value=value) for name, value in values.items()]
         result = self.result(client.set_parameters_atomically(changes), node).result
         if not result.successful:
@@ -290,12 +296,13 @@ class Ros:
         try:
             self.wait(client.service_is_ready, lambda: f"'{node}' does not answer")
             while not answered.is_set():
-                if time.monotonic() > end:
+                if self.closing.is_set() or time.monotonic() > end:
                     raise ClientError(f"'{node}' has not answered for {self.timeout:g} s")
                 client.call_async(GetState.Request()).add_done_callback(lambda _: answered.set())
                 answered.wait(ASK_AGAIN)
         finally:
             self.node.destroy_client(client)
+
     def trigger(self, service: str) -> str:
         """Ask a service without arguments and return what it says; ClientError if it refuses."""
         answer = self.call(Trigger, service, Trigger.Request())
@@ -463,6 +470,7 @@ class Finger:
         if self._reference.is_known:
             return float(self._reference.signal.at(elapsed))
         return self.state.reference if self.state else math.nan
+
     @property
     def is_silent(self) -> bool:
         """Whether no state came for so long that the finger is taken for gone."""
@@ -570,17 +578,17 @@ class Finger:
             feedforward = flatten(read_feedforward(servo))
         else:
             feedback, feedforward = values, self.ros.parameters(limiter)
+        feels = feedback.get("force_control", False)
+        name = values["controller_file"] or feedback["name"]
         return Setup(
-            controller=values["controller_file"] or feedback["name"],
-            is_closed=feedback["controller"] != "none",
+            controller="force control" if feels else name,
+            is_closed=feels or feedback["controller"] != "none",
             command_low=feedback["command_low"],
             command_high=feedback["command_high"],
             voltage_low=feedforward["voltage_low"],
             voltage_high=feedforward["voltage_high"],
             slew_limit=feedforward["slew_limit"],
-            force_limit=feedback["touch.force_limit"]
-            if feedback.get("force_control")
-            else math.nan,
+            force_limit=feedback["touch.force_limit"] if feels else math.nan,
         )
 
     def stop(self) -> None:

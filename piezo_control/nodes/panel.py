@@ -71,7 +71,7 @@ class Bench:
         """The newest first."""
         self._setups: dict[str, Setup | None] = {}
         self._workers = ThreadPoolExecutor(WORKERS, "command")
-        self._reviewers = ThreadPoolExecutor(WORKERS, "review")
+        self._reviewers = ThreadPoolExecutor(1, "review")
         self._stoppers = ThreadPoolExecutor(WORKERS, "stop")  # a stop waits for no other command
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from piezo_control.nodes.panel import Bench
 
 DRAW_PERIOD = 40  # ms
-WORDS_EVERY = 5  # drawings
+WORDS_PERIOD = 250  # ms
 LONGEST_WAIT = 2.0  # s for a browser that has lost what it was sent
 TITLES = {
     "position": "Position [µm]",
@@ -32,7 +32,7 @@ TITLES = {
 
 
 class Pace:
-    """Sends no more than a browser can draw: the next only when it says that it has drawn the last."""
+    """Sends no more traces than a browser can draw: the next only when it says that it has drawn the last."""
 
     def __init__(self) -> None:
         self.sent = 0
@@ -97,12 +97,11 @@ def build(document: Document, bench: Bench) -> None:
     def go_on() -> None:
         if pace.lets_go_on():
             traces.go_on()
-            if pace.sent % WORDS_EVERY == 0:
-                tell()
 
     tell()
     document.add_root(pace.beat)
     document.add_periodic_callback(go_on, DRAW_PERIOD)
+    document.add_periodic_callback(tell, WORDS_PERIOD)
     document.title = "piezo_gripper panel"
     style = TEMPLATES.get_template("widgets.css").render()
     attributes = {
