@@ -20,7 +20,6 @@ from piezo_control.panel.cards import Card, Gauge, Message, render
 from piezo_control.panel.controls import Controls, number
 from piezo_control.panel.history import History
 from piezo_control.panel.traces import LOOKS, MOST, SIGNALS, Traces, known
-from piezo_control.recording.reader import open_bag
 from piezo_control.waveform import SHAPES
 from piezo_gripper_msgs.msg import FingerState
 
@@ -315,28 +314,6 @@ def test_set_point_moves_the_finger_and_its_trace(page, left):
     left.wait_for(near(left, 0.0))
 
 
-def test_traces_have_more_than_twenty_samples_a_second_of_a_waveform(page, left):
-    page.fill("amplitude", "5")
-    page.fill("frequency", "2")
-    page.press("wave")
-    page.page.wait_for_function(
-        """() => {
-            const drawn = Bokeh.documents[0].get_model_by_name("source/left").data.deflection
-            return Math.max(...Array.from(drawn).filter(Number.isFinite)) > 4.5
-        }"""
-    )
-    drawn = page.trace("/left")
-    clock, deflection, reference = (drawn[n] for n in ("clock", "deflection", "reference"))
-    # In the best second, as what else runs on the machine has its share, too.
-    in_a_second = np.searchsorted(clock, clock + 1.0) - np.arange(len(clock))
-    assert max(in_a_second) > 20
-    assert np.nanmax(deflection) > 4.5 and np.nanmax(np.abs(reference)) <= 5.0
-    # `robust` settles within 4 ms, in which this sine moves by 0.25 µm.
-    np.testing.assert_allclose(deflection[-50:], reference[-50:], atol=0.5)
-    page.press("end_wave")
-    left.wait_for(near(left, 0.0))
-
-
 @pytest.mark.parametrize(
     "field, text, button, words",
     [
@@ -367,73 +344,6 @@ def test_loop_opens_and_another_controller_closes_it(page, left):
     page.page.locator(".controller select").select_option("robust")
     page.press("close_loop")
     page.shows("closed loop, robust", ".cards .loop")
-
-
-def test_recording(page, left, panel):
-    bag = panel.folder / "bag"
-    page.fill("bag", str(bag))
-    page.press("record")
-    page.shows(f"recording: into {bag}", ".messages")
-    number = left.newest().number
-    left.wait_for(lambda: left.newest().number > number + 100)
-    page.press("end_record")
-    page.shows("end of the recording: done", ".messages")
-    assert any(topic.endswith("/deflection") for topic in open_bag(bag).topics)
-
-
-def test_gripper(page, ros):
-    page.press("open")
-    page.shows("gripper: open: there: opening 80.00 µm", ".messages")
-    page.fill("opening", "40")
-    page.press("move")
-    page.shows("gripper: opening 40 µm: there", ".messages")
-    page.press("hold")
-    page.shows("gripper: hold: nothing was moving", ".messages")
-
-
-def test_stop_waits_for_nobody(page, ros, left):
-    """Every other command is kept waiting by a recorder that stands still."""
-    recorder = process_of("recorder", "__ns:=/left")
-    os.kill(recorder, signal.SIGSTOP)
-    try:
-        for _ in range(10):
-            page.press("record")
-        page.press("stop")
-        left.wait_for(lambda: left.state.phase == FingerState.IDLE)
-        right = ros.finger("right")
-        right.wait_for(lambda: right.state and right.state.phase == FingerState.IDLE)
-    finally:
-        os.kill(recorder, signal.SIGCONT)
-    assert left.state.voltage == 0.0 and right.state.voltage == 0.0
-    page.shows("idle", ".cards .words")
-    page.choose("both")
-    page.press("start")
-    for finger in (left, right):
-        finger.wait_for(lambda f=finger: f.state.phase == FingerState.RUNNING)
-
-
-def process_of(name, word):
-    """Return the process of an executable of this test's ROS domain that was started with some word."""
-    domain = f"ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}".encode()
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            words = (folder / "cmdline").read_bytes().decode().split("\0")
-            mine = domain in (folder / "environ").read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if mine and word in words and any(w.endswith(f"/{name}") for w in words):
-            return int(folder.name)
-    raise AssertionError(f"no {name} with {word}")
-
-
-def test_a_fault_is_shown_in_words_and_left_by_reset(page, ros, left):
-    ros.lifecycle("/left/feedback", "deactivate")
-    page.shows("fault: ", ".card.bad .words")
-    page.shows("/left/cantilever", ".complaints")
-    ros.lifecycle("/left/feedback", "activate")
-    page.press("reset")
-    left.wait_for(lambda: left.state.phase == FingerState.RUNNING)
-    page.shows("/left running closed loop", ".card.good")
 
 
 @pytest.fixture(scope="module")
