@@ -389,7 +389,7 @@ def test_pages_of_others_are_not_listened_to(panel):
     assert status[f"http://{host}:{port}"] != 403
 
 
-@pytest.mark.parametrize("width, height", [(1400, 900), (390, 844)], ids=["desktop", "phone"])
+@pytest.mark.parametrize("width, height", [(1400, 900)], ids=["desktop"])
 @pytest.mark.parametrize("scheme, dark", [("light", False), ("dark", True)], ids=["light", "dark"])
 def test_page_fits_the_screen_in_light_and_dark(panel, browser, width, height, scheme, dark):
     context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
