@@ -127,7 +127,7 @@ def test_waveform_is_followed_sample_by_sample_and_recorded(finger, tmp_path):
     (message,) = open_bag(tmp_path / "bag").messages("/finger/reference_waveform", WAVEFORM_TYPE)
     followed = Waveform.of(message)
     assert followed == replace(wanted, start=message.start)
-    assert before <= message.start - LEAD_TIME <= sent
+    assert before + LEAD_TIME <= message.start <= sent + LEAD_TIME
     recording = read(tmp_path / "bag")
     time = recording.number * SAMPLE_TIME
     heard = np.isfinite(recording.reference)
