@@ -181,6 +181,15 @@ class FingerNode(LifecycleNode):
         except RCLError:
             return TransitionCallbackReturn.FAILURE
 
+    def destroy_node(self) -> None:
+        """Free the node and all its entities, and with the last node the middleware's threads.
+
+        rclpy leaves the state machine's, and so the node. A middleware that still runs when the program exits
+        crashes now and then, or never ends.
+        """
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def _LifecycleNodeMixin__change_state(self, transition_id: int) -> TransitionCallbackReturn:
         # Every transition goes through this method of rclpy's mixin, which lets an impossible one end the
         # process. A client that asks for one gets "no" instead.
