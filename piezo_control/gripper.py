@@ -188,7 +188,7 @@ def opening_of(parameters: GripperParameters, deflections: Sequence[float]) -> f
 
 def force_of(pushes: Sequence[float]) -> float:
     """Return the larger of the object's pushes (N, >= 0) on the tips; NaN when one is not known."""
-    return math.nan if any(map(math.isnan, pushes)) else max([0.0, *pushes])
+    return math.nan if any(map(math.isnan, pushes)) else max(0.0, *pushes)
 
 
 def hold(reference: float) -> Profile:

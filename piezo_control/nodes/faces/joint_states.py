@@ -35,6 +35,8 @@ class JointStates:
     def _publish(self) -> None:
         gripper = self._gripper
         fingers = gripper.fingers
+        if not gripper.active:
+            return  # the timer's event was on its way when the gripper was stopped
         if any(finger.silence() for finger in fingers):
             return  # nobody shall take old places for new ones
         whole = gripper.measured()
