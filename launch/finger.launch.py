@@ -31,6 +31,10 @@ ARGUMENTS = {
     "use_sim_time": ("false", "stamps by /clock; the loop's watchdogs do not follow it"),
     "log_level": ("info", "of every node"),
 }  # fmt: skip
+SWITCH = ["true", "false", "True", "False"]
+CHOICES = {"plant": ["simulated", "none"], "mode": ["lockstep", "free_running"]} | {
+    name: SWITCH for name, (default, _) in ARGUMENTS.items() if default in SWITCH
+}
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -81,7 +85,9 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value=value, description=text)
+                DeclareLaunchArgument(
+                    name, default_value=value, description=text, choices=CHOICES.get(name)
+                )
                 for name, (value, text) in ARGUMENTS.items()
             ),
             OpaqueFunction(function=nodes),

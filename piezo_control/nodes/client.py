@@ -19,10 +19,11 @@ from __future__ import annotations
 
 import math
 import os
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -232,7 +233,7 @@ class Ros:
                 raise ClientError(
                     f"'{node}' refuses to {transition}: it is {self.lifecycle(node)}; its log says why"
                 )
-        return self.call(GetState, f"{node}/get_state", GetState.Request()).current_state.label
+        return self.meet(node)
 
     def parameters(self, node: str) -> dict[str, Any]:
         """Return all parameters of a node."""
@@ -285,21 +286,21 @@ class Ros:
         finally:
             self.node.destroy_client(client)
 
-    def meet(self, node: str) -> None:
-        """Ask a node for its state until it answers; from then on it has met every client that was made before.
+    def meet(self, node: str) -> str:
+        """Return the state of a node, asked until it answers: then it has met every client that was made before.
 
         What a node answers to a client that it has not met yet is lost, and most questions cannot be asked twice.
         """
         client = self.node.create_client(GetState, f"{node}/get_state")
-        answered = threading.Event()
+        answers: queue.SimpleQueue[Future] = queue.SimpleQueue()
         end = time.monotonic() + self.timeout
         try:
             self.wait(client.service_is_ready, lambda: f"'{node}' does not answer")
-            while not answered.is_set():
-                if self.closing.is_set() or time.monotonic() > end:
-                    raise ClientError(f"'{node}' has not answered for {self.timeout:g} s")
-                client.call_async(GetState.Request()).add_done_callback(lambda _: answered.set())
-                answered.wait(ASK_AGAIN)
+            while not self.closing.is_set() and time.monotonic() < end:
+                client.call_async(GetState.Request()).add_done_callback(answers.put)
+                with suppress(queue.Empty):
+                    return answers.get(timeout=ASK_AGAIN).result().current_state.label
+            raise ClientError(f"'{node}' has not answered for {self.timeout:g} s")
         finally:
             self.node.destroy_client(client)
 
