@@ -5,9 +5,11 @@
 
 The laws are those of the nodes (:mod:`piezo_control.feedback`, :mod:`piezo_control.feedforward`,
 :mod:`piezo_control.safety`). A servo that feels has the law of :mod:`piezo_control.touch` in place of K; what it
-expects of a tip that nobody pushes the models of :mod:`piezo_control.sensorless` say, which follow its voltage. What the certificate does not cover ends at rest and stays there until a reset:
-a sensor that is silent, old, frozen or out of its range, a deflection that the model cannot explain, a loop that
-oscillates, periods that are late or missed, a device that is gone.
+expects of a tip that nobody pushes the models of :mod:`piezo_control.sensorless` say, which follow its voltage.
+
+What the certificate does not cover ends at rest and stays there until a reset: a sensor that is silent, old, frozen
+or out of its range, a deflection that the model cannot explain, a loop that oscillates, periods that are late or
+missed, a device that is gone.
 """
 
 from __future__ import annotations
