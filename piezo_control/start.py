@@ -1,11 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts the executables: Ctrl-C during the second that their imports take ends them without a traceback."""
+"""Starts the executables, and tells them when to end: Ctrl-C during their imports ends them without a traceback."""
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import signal
+import time
 from collections.abc import Callable
+from typing import Any
+
+LOOK_PERIOD = 0.02  # s, between two looks at whether a signal came
+
+
+class Stop:
+    """Whether it is time to end; set by a signal, or by hand.
+
+    The handler of a signal runs between any two steps of the main thread, those of another handler included. So it
+    sets a plain value: the lock of a threading.Event could be held by the very thread that then waits for it.
+    """
+
+    def __init__(self) -> None:
+        self._is_set = False
+
+    def set(self, *_: Any) -> None:
+        """Say that it is time to end; may be called in the handler of a signal."""
+        self._is_set = True
+
+    def is_set(self) -> bool:
+        """Say whether it is time to end."""
+        return self._is_set
+
+    def wait(self, timeout: float) -> bool:
+        """Wait for as long as `timeout` (s) until it is time to end, and say whether it is."""
+        end = time.monotonic() + timeout
+        while not self._is_set and time.monotonic() < end:
+            time.sleep(LOOK_PERIOD)
+        return self._is_set
+
+
+def stop_at_signals() -> Stop:
+    """Return what the signals that end a program set; call from the main thread.
+
+    SIGHUP comes from a terminal that is closed; a program started with nohup has it ignored. So are all of them
+    while Python ends: it gives them back their default, and a second signal would turn a good end into a death.
+    """
+    stop = Stop()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, stop.set)
+            atexit.register(signal.signal, number, signal.SIG_IGN)
+    return stop
 
 
 def executable(module: str) -> Callable[[], int]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import signal
 import socket
 import struct
 import sys
@@ -24,9 +23,11 @@ import numpy as np
 from numba import types
 
 from piezo_control.compiled import compiled
+from piezo_control.options import port, within
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
 from piezo_control.servo.clock import Clock, become_real_time, clock_of, now
+from piezo_control.start import stop_at_signals
 from piezo_sim.driver import Device, device_of, read, write
 from piezo_sim.plant.cantilever import CantileverParameters
 
@@ -124,7 +125,7 @@ class UdpFinger:
 
     Its sensor says ``zero + scale * deflection`` (`scale` per m).
 
-    Raises OSError when the port cannot be had.
+    Raises OSError when the port cannot be had, UnicodeError for a host that cannot be a name in a network.
     """
 
     def __init__(
@@ -137,8 +138,9 @@ class UdpFinger:
         scale: float = 1.0,
         zero: float = 0.0,
     ) -> None:
+        [*_, address] = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0]
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind((host, port))
+        self._socket.bind(address)
         timeout = struct.pack("ll", 0, round(RAMP_PERIOD * 1e6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
         self.port = self._socket.getsockname()[1]
@@ -189,25 +191,25 @@ def main() -> int:
     """Run the command line and return its exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (%(default)s)")
-    parser.add_argument("--port", type=int, default=PORT, help="UDP port (%(default)s)")
+    parser.add_argument(
+        "--port", type=port, default=PORT, metavar="N",
+        help="UDP port, 0: any that is free (%(default)s)",
+    )  # fmt: skip
     parser.add_argument("--cantilever", metavar="FILE", help="parameter file of a cantilever")
     parser.add_argument("--report", metavar="FILE", help="where to write what was seen, as JSON")
     parser.add_argument(
         "--priority",
-        type=int,
+        type=within(int, 0, 99),
         default=0,
-        choices=range(100),
-        metavar="0 … 99",
-        help="of the real-time scheduler, 0: ordinary (%(default)s)",
+        metavar="N",
+        help="of the real-time scheduler, 0 … 99, 0: ordinary (%(default)s)",
     )
     parser.add_argument(
         "--scale", type=float, default=1.0, help="sensor: its unit per m (%(default)s)"
     )
     parser.add_argument("--zero", type=float, default=0.0, help="sensor: at 0 m (%(default)s)")
     arguments = parser.parse_args()
-    stopped = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, lambda *_: stopped.set())
+    stop = stop_at_signals()
     try:
         plant = CantileverParameters()
         if not (
@@ -224,11 +226,12 @@ def main() -> int:
             arguments.zero,
         )  # fmt: skip
         finger.start()
-    except (ParameterError, OSError, OverflowError) as error:
+    except (ParameterError, OSError, UnicodeError) as error:
         print(f"udp_finger: {error}", file=sys.stderr)
         return 2
     print(f"udp_finger: answers at {arguments.host}:{finger.port}", flush=True)
-    stopped.wait()
+    while not stop.wait(1.0):
+        pass
     report = asdict(finger.stop())
     print(json.dumps(report))
     if arguments.report:

@@ -22,6 +22,7 @@ LEVELS = [
         "shared",
         "compiled",
         "start",
+        "options",
     },
     {
         "hysteresis",

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
@@ -24,6 +23,7 @@ from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE, SETPOINT
+from piezo_control.start import Stop
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
@@ -399,7 +399,7 @@ def test_unusable_arguments_end_with_one_line(arguments, words, monkeypatch, cap
     robust = params_folder() / "feedback_robust.yaml"
     arguments = [argument.format(robust=robust) for argument in arguments]
     monkeypatch.setattr(sys, "argv", ["feedforward", "--ros-args", *arguments])
-    monkeypatch.setattr(base.spin, "stop_event", threading.Event)  # pytest keeps its signals
+    monkeypatch.setattr(base, "stop_at_signals", Stop)  # pytest keeps its signals
     assert base.run(FeedforwardNode) == 2
     assert words in capsys.readouterr().err
 
@@ -428,3 +428,31 @@ def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     process.send_signal(signal.SIGINT)
     _, words = process.communicate(timeout=TIMEOUT)
     assert (process.returncode, words) == (-signal.SIGINT, "")
+
+
+def test_a_signal_between_any_two_steps_of_the_handler_of_another_is_heard(tmp_path):
+    """Each line that runs while a signal is handled or waited for is interrupted by one more."""
+    (tmp_path / "program.py").write_text(
+        "import signal, sys\n"
+        "from piezo_control.start import stop_at_signals\n"
+        "stop = stop_at_signals()\n"
+        "left = [20]\n"
+        "def interrupt(frame, event, argument):\n"
+        "    if event == 'line' and left[0]:\n"
+        "        left[0] -= 1\n"
+        "        signal.raise_signal(signal.SIGINT)\n"
+        "    return interrupt\n"
+        "sys.settrace(interrupt)\n"
+        "while not stop.wait(0.05):\n    pass\n"
+        "stop.set()\n"
+        "print('at rest, interrupted', 20 - left[0])\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "program.py"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert int(ended.stdout.removeprefix("at rest, interrupted ")) > 3

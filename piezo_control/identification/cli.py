@@ -28,7 +28,7 @@ from piezo_control.dynamics import DynamicsParameters, ModesParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
-from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns, within
+from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
 from piezo_control.identification.confidence import Values, lines
 from piezo_control.identification.drift import SMALLEST_WARMING, identify_drift, is_loop
 from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics, need_vibration
@@ -45,6 +45,7 @@ from piezo_control.identification.measurement import (
     is_bag,
     read_measurement,
 )
+from piezo_control.options import within
 from piezo_control.parameters import ParameterError, build, dump, flatten, load
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+
+from piezo_control.options import within
 
 QUANTITIES = {  # the units a column may have, the first of them where nothing says which
     "time": ("s", "ms", "us", "min"),
@@ -33,18 +34,6 @@ def add_options(parser: argparse.ArgumentParser, quantities: Mapping[str, tuple[
         "--sample-rate", type=within(float, 1e-6, 1e9), metavar="HZ",
         help="rows come evenly; takes the place of a column with the time",
     )  # fmt: skip
-
-
-def within(kind: type, low: float, high: float = math.inf) -> Callable[[str], float]:
-    """Return what reads an option: a number of a `kind` from `low` to `high`."""
-
-    def number(text: str) -> float:
-        value = kind(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text} is not within [{low:g}, {high:g}]")
-        return value
-
-    return number
 
 
 def chosen_columns(

@@ -38,6 +38,7 @@ from piezo_control.parameters import (
     unknown,
 )
 from piezo_control.safety import PHASES, Guard
+from piezo_control.start import stop_at_signals
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 
@@ -306,7 +307,7 @@ def run(*node_types: type[FingerNode]) -> int:
 
     Several nodes start in the order given and stop in the opposite one.
     """
-    stop = spin.stop_event()
+    stop = stop_at_signals()
     nodes: list[FingerNode] = []
     try:
         parse(node_types)

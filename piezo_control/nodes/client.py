@@ -2,7 +2,8 @@
 """Running fingers and grippers from Python, without a node of one's own and without the `ros2` command.
 
     from piezo_control.nodes.client import connect
-    from piezo_control.waveform import Waveform
+    from piezo_control.start import LOOK_PERIOD, Stop
+from piezo_control.waveform import Waveform
 
     with connect() as ros:
         finger = ros.finger("finger")
@@ -54,12 +55,12 @@ from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.nodes.spin import LONGEST_WAIT
 from piezo_control.parameters import build, declarations, flatten
 from piezo_control.safety import LARGEST_DEFLECTION
+from piezo_control.start import LOOK_PERIOD, Stop
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
-LOOK_PERIOD = 0.02  # s, between two looks at something that is waited for
 ASK_AGAIN = 0.5  # s, for what can be asked more than once
 FIRST_MESSAGE = 0.3  # s in which the first message of a topic comes, if it does
 SILENCE = 2.0  # s; a state comes every second at least
@@ -176,14 +177,15 @@ class Ros:
     """A connection to the nodes of this ROS domain; made by :func:`connect`."""
 
     def __init__(
-        self, node: Node, watcher: Node, executor: SingleThreadedExecutor, timeout: float
-    ) -> None:
+        self, node: Node, watcher: Node, executor: SingleThreadedExecutor, timeout: float,
+        closing: Stop,
+    ) -> None:  # fmt: skip
         self.node = node
         self._executor = executor
         self.watcher = watcher
         self.timeout = timeout
         self._parameter_clients: dict[str, AsyncParameterClient] = {}
-        self.closing = threading.Event()
+        self.closing = closing
         """Nothing is waited for any more."""
         self.diagnostics: dict[str, DiagnosticStatus] = {}
         """The newest of each node, by its full name."""
@@ -648,10 +650,16 @@ class Finger:
 
 
 @contextmanager
-def connect(timeout: float = 10.0) -> Iterator[Ros]:
-    """Return a connection to the nodes of this ROS domain; `timeout` (s) holds for every answer."""
+def connect(timeout: float = 10.0, closing: Stop | None = None) -> Iterator[Ros]:
+    """Return a connection to the nodes of this ROS domain; `timeout` (s) holds for every answer.
+
+    Once `closing` is set, by a signal for example, all that is waited for ends with a ClientError. A program should
+    end the connection whatever ends it: of one that is killed the finger's middleware keeps sending to a memory that
+    nobody reads, and for half a minute the next client may hear nothing there.
+    """
+    closing = closing or Stop()
     context = Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
     node, watcher = (
         rclpy.create_node(
             f"{name}_{os.getpid()}",
@@ -663,10 +671,10 @@ def connect(timeout: float = 10.0) -> Iterator[Ros]:
     )
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    ros = Ros(node, watcher, executor, timeout)
+    ros = Ros(node, watcher, executor, timeout, closing)
 
     def spin() -> None:
-        while not ros.closing.is_set():
+        while not closing.is_set():
             executor.spin_once(timeout_sec=LONGEST_WAIT)
 
     thread = threading.Thread(target=spin, name="client", daemon=True)
@@ -674,7 +682,7 @@ def connect(timeout: float = 10.0) -> Iterator[Ros]:
     try:
         yield ros
     finally:
-        ros.closing.set()
+        closing.set()
         thread.join()
         executor.shutdown()
         watcher.destroy_node()

@@ -4,7 +4,7 @@
 Without --finger it is the only finger that runs. Lengths are in µm, forces in mN, as on plots and reports; times
 and frequencies are those of the finger, whose simulation may be slower or faster than the wall.
 
-Exit code: 0 done, 1 refused or not answered, 2 unusable arguments.
+Exit code: 0 done, 1 refused, not answered or stopped by a signal, 2 unusable arguments.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from rich.text import Text
 
 from piezo_control.nodes.client import TRANSITIONS, ClientError, Finger, Ros, connect
 from piezo_control.nodes.overview import ROWS, complaints, ended, in_order
+from piezo_control.options import positive
+from piezo_control.start import stop_at_signals
 from piezo_control.waveform import SHAPES, Waveform
 
 WATCH_PERIOD = 0.1  # s
@@ -36,11 +38,8 @@ BARS = "▁▂▃▄▅▆▇█"
 def main() -> int:
     """Run the command line and return its exit code."""
     arguments = parse(sys.argv[1:])
-    try:
-        with connect(arguments.timeout) as ros:
-            return carry_out(ros, arguments, Console())
-    except KeyboardInterrupt:
-        return 0
+    with connect(arguments.timeout, stop_at_signals()) as ros:
+        return carry_out(ros, arguments, Console())
 
 
 def carry_out(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
@@ -48,7 +47,7 @@ def carry_out(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     try:
         return arguments.run(ros, arguments, console) or 0
     except ClientError as error:
-        print(f"fingerctl: {error}", file=sys.stderr)
+        print(f"fingerctl: {'stopped' if ros.closing.is_set() else error}", file=sys.stderr)
         return 1
     except ValueError as error:
         print(f"fingerctl: {error}", file=sys.stderr)
@@ -76,7 +75,7 @@ def is_near(finger: Finger, target: float, near: float) -> bool:
 def list_all(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     """Print the fingers that are there and their nodes."""
     ros.wait(lambda: bool(ros.fingers()), lambda: "no finger is running in this ROS domain")
-    time.sleep(DISCOVERY)
+    ros.closing.wait(DISCOVERY)
     for finger in (Finger(ros, name) for name in ros.fingers()):
         names = [name.rpartition("/")[2] for name in finger.nodes()]
         console.print(f"{finger.namespace}: {', '.join(names)}", highlight=False)
@@ -100,13 +99,12 @@ def watch(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     traces = {f.namespace: deque[float](maxlen=TRACE) for f in chosen}
     end = time.monotonic() + (arguments.seconds or math.inf)
     with Live(console=console, auto_refresh=False) as live:
-        while time.monotonic() < end:
+        while time.monotonic() < end and not ros.closing.wait(WATCH_PERIOD):
             for finger in chosen:
                 traces[finger.namespace].append(finger.newest().deflection)
             table = overview(chosen, traces)
             table.caption = "\n".join(complaints(ros)) or None
             live.update(table, refresh=True)
-            time.sleep(WATCH_PERIOD)
     return 0
 
 
@@ -315,11 +313,3 @@ def parse(words: list[str]) -> argparse.Namespace:
     values.add_argument("name", nargs="?", default="")
     values.add_argument("value", nargs="?", help="as YAML")
     return parser.parse_args(words)
-
-
-def positive(text: str) -> float:
-    """Return a number above 0."""
-    value = float(text)
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
-    return value

@@ -35,11 +35,12 @@ except ModuleNotFoundError as error:
 
 from piezo_control.nodes.client import ClientError, Finger, Gripper, Ros, Setup, connect
 from piezo_control.nodes.overview import ROWS, complaints, ended, figure, in_order
-from piezo_control.nodes.spin import stop_event
+from piezo_control.options import port, positive
 from piezo_control.panel.cards import Card, Gauge, Message
 from piezo_control.panel.history import History
 from piezo_control.panel.page import build
 from piezo_control.panel.traces import COLORS, LOOKS, SIGNALS, SPANS, known
+from piezo_control.start import stop_at_signals
 from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState
 
@@ -245,15 +246,15 @@ def main() -> int:
     """Serve the page until a signal comes, and return the exit code."""
     arguments = parse(sys.argv[1:])
     logging.getLogger("bokeh").setLevel(logging.ERROR)  # a browser that is closed is no warning
-    stop = stop_event()
+    stop = stop_at_signals()
     loop = IOLoop.current()
-    with connect(arguments.timeout) as ros:
+    with connect(arguments.timeout, stop) as ros:
         names = ["/" + name.strip("/") for name in arguments.finger]
         bench = Bench(ros, names, arguments.control)
         try:
             server = serve(bench, arguments.host, arguments.port, loop)
-        except OSError as error:
-            print(f"panel: no page on {arguments.host}:{arguments.port}: {error.strerror}", file=sys.stderr)  # fmt: skip
+        except (OSError, UnicodeError) as error:
+            print(f"panel: no page on {arguments.host}:{arguments.port}: {error}", file=sys.stderr)
             return 1
         mode = "with controls" if arguments.control else "read-only; --control lets it drive"
         print(f"panel: http://{arguments.host}:{server.port}/ ({mode})", flush=True)
@@ -297,9 +298,11 @@ def parse(words: list[str]) -> argparse.Namespace:
         "--host", default="localhost", metavar="NAME",
         help="of this machine, as browsers shall call it (localhost: for this machine alone)",
     )  # fmt: skip
-    parser.add_argument("--port", type=int, default=5006, help="0: any that is free (5006)")
     parser.add_argument(
-        "--timeout", type=float, default=5.0, metavar="S", help="for every answer (5)"
+        "--port", type=port, default=5006, metavar="N", help="0: any that is free (5006)"
+    )  # fmt: skip
+    parser.add_argument(
+        "--timeout", type=positive, default=5.0, metavar="S", help="for every answer (5)"
     )
     arguments = parser.parse_args(words)
     if len(arguments.finger) > MOST_FINGERS:

@@ -14,11 +14,8 @@ publishers still alive.
 
 from __future__ import annotations
 
-import atexit
 import gc
 import os
-import signal
-import threading
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -37,20 +34,6 @@ def init(args: list[str] | None = None) -> None:
     """
     os.environ.setdefault("RMW_FASTRTPS_PUBLICATION_MODE", "SYNCHRONOUS")
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-
-
-def stop_event() -> threading.Event:
-    """Return an event that the signals which end a program set; call from the main thread.
-
-    SIGHUP comes from a terminal that is closed; a program started with nohup has it ignored. So are all of them
-    while Python ends: it gives them back their default, and a second signal would turn a good end into a death.
-    """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, lambda *_: stop.set())
-            atexit.register(signal.signal, number, signal.SIG_IGN)
-    return stop
 
 
 def spin(nodes: Sequence[Node], done: Callable[[], bool]) -> None:

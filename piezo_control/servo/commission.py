@@ -45,6 +45,7 @@ from piezo_control.identification.hysteresis import (  # noqa: E402
     identify_hysteresis,
 )
 from piezo_control.identification.measurement import Measurement, MeasurementError  # noqa: E402
+from piezo_control.options import within  # noqa: E402
 from piezo_control.parameters import ParameterError, dump, flatten  # noqa: E402
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
@@ -326,7 +327,9 @@ def parse() -> argparse.Namespace:
         "--sample-time", type=float, default=1e-4, metavar="S", help="(%(default)s)"
     )
     parser.add_argument("--write", choices=("immediately", "next_edge"), default="immediately")
-    parser.add_argument("--priority", type=int, default=80, help="real-time priority (%(default)s)")
+    parser.add_argument(
+        "--priority", type=within(int, 0, 99), default=80, help="real-time priority (%(default)s)"
+    )
     limits = VoltageParameters()
     for name, unit in (("voltage_low", "V"), ("voltage_high", "V"), ("slew_limit", "V/s")):
         parser.add_argument(

@@ -37,7 +37,7 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
-    """Do a study and show what it found; return the exit code: 0 done, 1 failed, 2 unusable input."""
+    """Do a study and show what it found; return the exit code: 0 done, 1 failed or stopped, 2 unusable input."""
     console = Console()
     out = arguments.out
     try:
@@ -51,6 +51,9 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
         return 2
     except (RunFailed, BagError, OSError) as error:
         print(f"{out.name}: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f"{out.name}: stopped; what was there before in {out} is unchanged", file=sys.stderr)
         return 1
     for section in sections:
         print_table(console, section)

@@ -14,8 +14,8 @@ import argparse
 import sys
 
 from piezo_control.feedback import read_controller
-from piezo_control.nodes import spin
 from piezo_control.parameters import ParameterError
+from piezo_control.start import stop_at_signals
 from piezo_sim.experiment.on_nodes.processes import NodeDied, NodeProcesses
 from piezo_sim.plant.cantilever import CantileverParameters
 
@@ -31,7 +31,7 @@ def main() -> int:
     except ParameterError as error:
         print(f"gripper_stack: {error}", file=sys.stderr)
         return 2
-    stop = spin.stop_event()
+    stop = stop_at_signals()
     try:
         with NodeProcesses(commands(arguments, finger)) as nodes:
             while not stop.wait(0.1):

@@ -12,6 +12,7 @@ import rclpy
 from rich.progress import Progress
 
 from piezo_control.nodes import spin
+from piezo_control.start import stop_at_signals
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment.cases import NODES, Case, CaseRun, RunFailed, params_folder
 from piezo_sim.experiment.on_nodes.conductor import Conductor
@@ -37,7 +38,7 @@ def run_cases(
     discovery = params_folder() / "discovery.xml"
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(discovery))
     spin.init()
-    stop = spin.stop_event()
+    stop = stop_at_signals()
     commands = {
         name: ["--ros-args", "-r", f"__ns:=/{namespace}", "-p", "autostart:=false"]
         for name in NODES

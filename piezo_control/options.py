@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What reads the numbers of a command line, and says which are allowed."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+
+
+def within(kind: type, low: float, high: float = math.inf) -> Callable[[str], float]:
+    """Return what reads an option: a number of a `kind` from `low` to `high`."""
+
+    def number(text: str) -> float:
+        value = kind(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"{text} is not within [{low:g}, {high:g}]")
+        return value
+
+    number.__name__ = kind.__name__  # argparse says "invalid int value" for a text that is none
+    return number
+
+
+def positive(text: str) -> float:
+    """Read an option: a finite number above 0."""
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return value
+
+
+port = within(int, 0, 65535)
+"""Reads the number of a port."""
