@@ -221,9 +221,17 @@ class Page:
         """Wait until a part of the page shows a text."""
         self.page.locator(where).filter(has_text=text).first.wait_for()
 
+    def ask(self, question):
+        """Return what a function in the browser returns, once a page is there.
+
+        It is opened anew whenever the panel has found more to show, and then asked again.
+        """
+        is_there = "window.Bokeh?.documents[0]?.get_model_by_name('cards')"
+        return self.page.wait_for_function(f"() => {is_there} && ({question})()").json_value()
+
     def trace(self, finger):
         """Return what is drawn of a finger's signals, in their units, and the times in s."""
-        columns = self.page.evaluate(
+        columns = self.ask(
             f"""() => Object.entries(Bokeh.documents[0].get_model_by_name("source{finger}").data)
                 .map(([name, values]) => [name, Array.from(values)])"""
         )
@@ -357,10 +365,10 @@ def test_without_control_there_is_nothing_to_drive_with(onlooker, browser, left)
     page = Page(browser.new_context(), onlooker.address)
     page.shows("read-only")
     page.shows("/left", ".cards")
-    buttons = page.page.get_by_role("button").all_inner_texts()
+    buttons = page.ask("() => Array.from(document.querySelectorAll('button'), b => b.innerText)")
     assert set(buttons) <= {"10 s", "1 min", "10 min", "Freeze"}
     # Nor is there anything in the server that a page made by hand could speak to.
-    names = page.page.evaluate(
+    names = page.ask(
         "() => Array.from(Bokeh.documents[0]._all_models.values()).map(model => model.name)"
     )
     assert {"set_point", "stop", "go", "wave"} & set(names) == set()
@@ -407,7 +415,7 @@ def test_page_fits_the_screen_in_light_and_dark(panel, browser, width, height, s
 
 def test_command_line():
     for words, code, said in (
-        (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: Cannot assign"),
+        (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: [Errno 99] Cannot assign"),
         (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
     ):
         done = subprocess.run(
