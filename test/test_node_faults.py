@@ -17,11 +17,14 @@ from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
+from trajectory_msgs.msg import JointTrajectory
 
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
+from piezo_control.nodes.gripper import GripperNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE, SETPOINT
 from piezo_control.start import Stop
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
@@ -412,6 +415,23 @@ def test_whole_numbers_stand_for_doubles():
     assert node.parameters.hysteresis.weights == (1.0,)
     assert node.set_parameters([Parameter("voltage_low", value=-7)])[0].successful
     assert node.parameters.voltage_low == -7.0
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing():
+    """They are called as the executor calls what it had queued before."""
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    states, commands, _ = node.faces
+    node.trigger_deactivate()
+    states._publish()
+    commands._on_command(JointState(name=["gripper_joint"], position=[3e-5]))
+    commands._on_trajectory(JointTrajectory(joint_names=["gripper_joint"]))
+    node._watch()
+    assert node.motion is None
     node.destroy_node()
     rclpy.shutdown()
 
