@@ -73,8 +73,8 @@ class FeedbackParameters:
     )
     preview_band: float = parameter(
         0.0,
-        "profiles and waveforms, known ahead, are followed without lag below this frequency; 0: as they come. "
-        "Of `feedback` and the engine, not of the servo", unit="Hz", low=0.0, high=1e5,
+        "profiles and waveforms, known ahead, are followed without lag below this frequency; 0: as they come",
+        unit="Hz", low=0.0, high=1e5,
     )  # fmt: skip
 
     def __post_init__(self) -> None:

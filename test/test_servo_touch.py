@@ -2,6 +2,7 @@
 """The servo that feels: its law against the engine's, a finger in real time, and a gripper of two servos."""
 
 import io
+import math
 import signal
 import subprocess
 from contextlib import ExitStack, contextmanager
@@ -190,6 +191,8 @@ def test_a_gripper_of_two_servos_grasps_and_lets_go(tmp_path):
         finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
         # Nobody publishes a temperature here, and that is said where people look.
         finger.wait_for(lambda: finger.state.text == "temperature missing: none for 5 s")
+        assert math.isnan(finger.state.temperature)
+        finger.wait_for(lambda: finger.state.tip_force >= AT_LIMIT * LIMIT)
         text = io.StringIO()
         arguments = fingerctl.parse(["-f", "left", "state"])
         assert fingerctl.carry_out(ros, arguments, Console(file=text, width=120)) == 0

@@ -98,6 +98,12 @@ class ServoNodeParameters(ServoParameters):
     feedforward_file: str = parameter(
         "", "parameter file of the inverse hysteresis and the limits; empty: the paper's finger"
     )
+    preview_band: float = parameter(
+        0.0,
+        "profiles and waveforms, known ahead, are followed without lag below this frequency; 0: that of the "
+        "controller's file; also while running",
+        unit="Hz", low=0.0, high=1e5,
+    )  # fmt: skip
     voltage_share: float = parameter(
         1.0,
         "share of the way from rest to the voltage limits that is used, for a first power-on",

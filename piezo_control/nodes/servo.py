@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,7 @@ class ServoNode(FingerNode):
         self._errors: list[tuple[float, float]] = []
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
-        return names - {"controller_file", "tolerance", "sample_period"}
+        return names - {"controller_file", "preview_band", "tolerance", "sample_period"}
 
     def check(self, parameters: ServoNodeParameters) -> None:
         if parameters.controller_file != self.parameters.controller_file or not self.active:
@@ -99,7 +100,9 @@ class ServoNode(FingerNode):
                 )
 
     def _controller(self, name: str) -> FeedbackParameters:
-        return successor(name, self.servo.feedback if self.servo else FeedbackParameters())
+        controller = successor(name, self.servo.feedback if self.servo else FeedbackParameters())
+        band = self.parameters.preview_band or controller.preview_band
+        return replace(controller, preview_band=band)
 
     def start(self) -> None:
         p = self.parameters
@@ -295,9 +298,12 @@ class ServoNode(FingerNode):
         self._publish_state()
 
     def _publish_state(self) -> None:
-        state = FingerState(phase=self.phase)
+        # What no thermometer and no model of a contact says is not known.
+        state = FingerState(phase=self.phase, temperature=self.thermometer.degc, tip_force=math.nan)
         state.header.stamp = base.system_time()
         if s := self.servo:
+            if self.parameters.force_control:
+                state.tip_force = s.push
             self._rates.append((time.monotonic(), s.number + 1 - s.missed))
             self._rates = self._rates[-11:]
             state.samples = max(0, s.number + 1)

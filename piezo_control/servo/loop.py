@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from piezo_control.compiled import compiled
+from piezo_control.design.preview import asked
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError
@@ -65,9 +66,13 @@ class Orders(NamedTuple):
 
 
 class References(NamedTuple):
-    """A ring of references (m) by sample number; `until` is the first number not laid out."""
+    """A ring by sample number of references (m) and of what the controller is asked for them, ahead of its lag.
+
+    `until` is the first number not laid out.
+    """
 
     values: np.ndarray
+    asked: np.ndarray
     until: np.ndarray
 
 
@@ -145,8 +150,7 @@ def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int
     """Return the voltage (V) that answers a reading, and take everything down."""
     number = loop.clock.number[0]
     references, log = loop.references, loop.log
-    newest = min(number, references.until[0] - 1)
-    reference = references.values[newest % len(references.values)]
+    place = min(number, references.until[0] - 1) % len(references.values)
     voltage = servo_step(
         loop.settings,
         loop.laws,
@@ -155,14 +159,14 @@ def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int
         status,
         reading[0],
         reading[1],
-        reference,
+        references.asked[place],
         share,
     )
     row = log.count[0] % len(log.number)
     log.number[row] = number
     log.instant[row] = loop.clock.edge[0]
     log.late[row] = late
-    log.reference[row] = reference
+    log.reference[row] = references.values[place]
     log.deflection[row] = math.nan
     if status == FRESH:
         c = loop.settings
@@ -243,7 +247,7 @@ class Servo:
             watch=watch_at_rest(),
             clock=clock_of(h, min(spin, 0.8 * h)),
             orders=Orders(*(np.zeros(1, dtype=np.int64) for _ in Orders._fields)),
-            references=References(np.full(ahead, 0.0), np.zeros(1, dtype=np.int64)),
+            references=References(np.zeros(ahead), np.zeros(ahead), np.zeros(1, dtype=np.int64)),
             log=Log(
                 np.zeros(1, dtype=np.int64),
                 *(np.full(kept, 0, dtype=np.int64) for _ in range(3)),
@@ -317,6 +321,7 @@ class Servo:
         put_controller(self._loop.laws.controllers[other], feedback)
         self.feedback = feedback
         orders.controller[0] = other
+        self._ask()
 
     @property
     def number(self) -> int:
@@ -330,6 +335,12 @@ class Servo:
         """
         self._signal = signal
         self._loop.laws.feeling.max_force[0] = min(max_force, self._force_limit)
+        self._ask()
+
+    def _ask(self) -> None:
+        """Lay out anew what the controller is asked."""
+        feels = self._loop.settings.feels
+        self._asked = self._signal if feels else asked(self._signal, self.feedback)
         self._lay_out(self.number + MARGIN if self.is_running else 0)
 
     def look_ahead(self) -> None:
@@ -342,7 +353,10 @@ class Servo:
         if last <= first:
             return
         numbers = np.arange(max(first, last - len(ring.values) // 2), last)
-        ring.values[numbers % len(ring.values)] = self._signal.at(numbers * self.sample_time)
+        places, times = numbers % len(ring.values), numbers * self.sample_time
+        ring.values[places] = self._signal.at(times)
+        is_asked = self._asked is self._signal
+        ring.asked[places] = ring.values[places] if is_asked else self._asked.at(times)
         ring.until[0] = last
 
     def samples(self) -> Samples:
