@@ -22,6 +22,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+from piezo_control.design.cli import read_problem
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
@@ -31,6 +32,7 @@ from piezo_control.parameters import ParameterError, dump, load
 from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING
 from piezo_control.servo import law
+from piezo_control.servo.commission import PROBLEM, at_its_pace
 from piezo_control.servo.driver import (
     FAILED,
     FRESH,
@@ -330,6 +332,15 @@ def test_a_profile_that_travels_ahead_is_followed_without_lag():
     np.testing.assert_array_equal(ring.asked[numbers], wave.at(numbers * H))
 
 
+@pytest.mark.parametrize("hertz, times", [(2000.0, 1.0), (666.6, 1.0), (200.0, 3.333)])
+def test_a_slow_finger_is_asked_for_as_many_periods_as_the_paper_s(hertz, times):
+    problem = read_problem(PROBLEM)
+    model = replace(problem.finger, denominator=(1.0 / (2.0 * math.pi * hertz) ** 2, 1e-5, 1.0))
+    asked = at_its_pace(replace(problem, finger=model)).specification
+    assert asked.settling_time == pytest.approx(times * 6e-3, rel=1e-3)
+    assert asked.force_settling_time == pytest.approx(times * 15e-3, rel=1e-3)
+
+
 # --- the loop in real time, without ROS -------------------------------------------------------------
 
 PATIENT = ServoParameters(missed_limit=10**6, late_share=1.0)  # other processes share this machine
@@ -540,6 +551,12 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     finger = load(found / "cantilever.yaml", "cantilever")
     np.testing.assert_allclose(finger["dynamics.denominator"], (5.7e-8, 8.1e-6, 1.0), rtol=0.05)
     assert finger["sensor.delay_samples"] == 1
+    # The watchdogs are of its size: it reaches 44 µm or so with 80 V (control-reference).
+    stroke = (servo["sensor_high"] - servo["sensor_low"]) / 1.5
+    assert stroke == pytest.approx(44e-6, rel=0.1)
+    assert servo["model_tolerance"] == pytest.approx(0.75 * stroke)
+    assert servo["cycle_amplitude"] == pytest.approx(stroke / 8)
+    assert servo["frozen_voltage"] == pytest.approx(4.0)
     stand.start_servo(found)
     stand.wait(lambda: stand.phase == FingerState.RUNNING)
     stand.reference.publish(Sample(value=20e-6))

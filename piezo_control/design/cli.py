@@ -87,17 +87,21 @@ def main() -> int:
         console.print(f"wrote {path}", soft_wrap=True)
     console.print(f"took {time.perf_counter() - begin:.1f} s")
     if not certificate.met:
-        failed = "; ".join(distance(row) for row in certificate.rows if not row.met)
         hint = "" if arguments.force else f". {out} is only written with --force"
-        print(f"synthesize: NOT certified. The best design found: {failed}{hint}", file=sys.stderr)
+        print(f"synthesize: {shortfall(certificate)}{hint}", file=sys.stderr)
     return 0 if certificate.met else 1
 
 
-def distance(row: Row) -> str:
-    """Say how far the worst finger is from what a line of the certificate requires, and which one it is."""
-    unit = f" {row.unit}" if row.unit else ""
-    where = f" ({row.at})" if row.at else ""
-    return f"{row.specification} {row.worst:.4g}{unit}, required {row.relation} {row.required:.4g}{unit}{where}"
+def shortfall(certificate: Certificate) -> str:
+    """Say how far the worst fingers are from what a certificate requires, and which ones they are."""
+
+    def distance(row: Row) -> str:
+        unit = f" {row.unit}" if row.unit else ""
+        where = f" ({row.at})" if row.at else ""
+        return f"{row.specification} {row.worst:.4g}{unit}, required {row.relation} {row.required:.4g}{unit}{where}"
+
+    missed = "; ".join(distance(row) for row in certificate.rows if not row.met)
+    return f"NOT certified. The best design found: {missed}"
 
 
 BLOCKS = {
