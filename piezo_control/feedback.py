@@ -129,10 +129,10 @@ def known_controllers(folders: Sequence[Path] = ()) -> list[str]:
     return list(dict.fromkeys(path.stem.removeprefix("feedback_") for path in files))
 
 
-def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters:
-    """Return the controller called `name`, from `folder` or the shipped ones, or that of a parameter file.
+def controller_file(name: str, folder: Path | None = None) -> Path:
+    """Return the file of the controller called `name`, from `folder` or the shipped ones, or the file of that path.
 
-    Raises ParameterError naming the file, or the known controllers where there is no such file.
+    Raises ParameterError naming the known controllers where there is no such file.
     """
     folders = [*([folder] if folder else []), shared_folder() / "params"]
     named = [place / f"feedback_{name}.yaml" for place in folders]
@@ -143,6 +143,15 @@ def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters
     if path is None:
         known = ", ".join(known_controllers(folders))
         raise ParameterError(f"controller '{name}' is no file, and not one of the known {known}")
+    return path
+
+
+def read_controller(name: str, folder: Path | None = None) -> FeedbackParameters:
+    """Return the controller called `name`; see :func:`controller_file`.
+
+    Raises ParameterError naming the file, or the known controllers where there is no such file.
+    """
+    path = controller_file(name, folder)
     return build(FeedbackParameters, load(path, "feedback"), str(path))
 
 

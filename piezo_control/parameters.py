@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
+import itertools
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping
@@ -219,6 +220,26 @@ def need_one_for(path: str | Path, nodes: Collection[str]) -> None:
             f"{path}: nothing for node {' or '.join(map(repr, nodes))}; it has {list(_sections(path))} ('/**/NAME' "
             "is node NAME in any namespace)"
         )
+
+
+def provenance(path: str | Path) -> list[str]:
+    """Return what the head of a parameter file says of where its values come from; empty: nothing.
+
+    Where it begins with a name, as `identify` writes one in front of each line of a block, that is the first line of
+    each block; of any other head the first line of all. Raises ParameterError for a file that cannot be read.
+    """
+    try:
+        lines = Path(path).read_text().splitlines()
+    except (OSError, ValueError) as error:
+        raise ParameterError(f"{path}: cannot be read: {error}") from None
+    head = [line[2:] for line in itertools.takewhile(lambda line: line.startswith("# "), lines)]
+    blocks: dict[str, str] = {}
+    for line in head:
+        if named := re.match(r"(\w+): ", line):
+            blocks.setdefault(named[1], line)
+        elif not blocks:
+            return [line]
+    return list(blocks.values())
 
 
 def _sections(path: str | Path) -> dict[str, dict]:

@@ -87,6 +87,7 @@ def test_every_node_says_once_what_it_waits_for_and_that_it_runs(ros):
         "[finger.cantilever]: running, at sample 1",
     ):
         assert said.count(words) == 1, said
+    assert said.count("feedback_robust.yaml: Controller 'robust', by `synthesize") == 1
 
 
 def near(finger, target):
@@ -204,6 +205,15 @@ def test_fingerctl_lifecycle_and_parameters(control):
     assert yaml.safe_load(text)["sample_time"] == SAMPLE_TIME
     assert control("params", "cantilever", "hold_time", "1") == (0, "")
     assert control("params", "cantilever", "hold_time") == (0, "{hold_time: 1.0}\n")
+
+
+def test_diagnostics_say_where_a_controller_comes_from(ros):
+    def values():
+        status = ros.diagnostics.get("/finger/feedback")
+        return {pair.key: pair.value for pair in status.values} if status else {}
+
+    ros.wait(lambda: "controller from" in values(), lambda: str(ros.diagnostics))
+    assert values()["controller from"].startswith("Controller 'robust', by `synthesize")
 
 
 @pytest.mark.parametrize(

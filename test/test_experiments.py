@@ -314,6 +314,8 @@ def test_command_line_runs_analyses_and_compares(monkeypatch, tmp_path, capsys):
     assert 'href="bags/step_feedback_paper_25degc/"' in page and 'href="metrics.json"' in page
     assert QUANTITIES["static_error_percent"].definition in page
     assert "cantilever: plant" in page and "truth" in page
+    assert "Where the parameters come from" in page
+    assert "Controller &#39;robust&#39;, by `synthesize synthesis_robust.yaml`. Certified" in page
 
     assert mine.read_text() == "a day's work"
     assert (

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import ParameterError, build, load, need_one_for
+from piezo_control.parameters import ParameterError, build, load, need_one_for, provenance
 
 
 def written(tmp_path, text):
@@ -35,6 +35,22 @@ def test_a_dump_of_a_running_node_is_read(tmp_path):
     assert load(written(tmp_path, text), "feedforward") == {"voltage_high": 35.0}
     with pytest.raises(ParameterError, match="nothing for node 'feedback'"):
         load(written(tmp_path, text), "feedback")
+
+
+@pytest.mark.parametrize(
+    "head, said",
+    [
+        ("", []),
+        ("# Made by hand.\n# proven: by nobody\n", ["Made by hand."]),
+        (
+            "# hysteresis: from a.csv\n# hysteresis: 95 %\n# dynamics: from b.csv\n# The limits\n# are yours.\n",
+            ["hysteresis: from a.csv", "dynamics: from b.csv"],
+        ),
+    ],
+)
+def test_a_head_says_where_values_come_from(tmp_path, head, said):
+    """As `identify` writes them, block by block, and everybody else in a sentence."""
+    assert provenance(written(tmp_path, f"{head}a: 1\n# inside\n")) == said
 
 
 @pytest.mark.parametrize(

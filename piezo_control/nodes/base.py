@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import rclpy
@@ -34,7 +35,9 @@ from piezo_control.parameters import (
     ParameterError,
     build,
     declarations,
+    is_for,
     need_one_for,
+    provenance,
     unknown,
 )
 from piezo_control.safety import PHASES, Guard
@@ -110,6 +113,9 @@ class FingerNode(LifecycleNode):
         self.parameters: Any = build(self.PARAMETERS, self._values({}), self.NAME)
         self.active = False
         self._said = ""
+        self._origins: dict[
+            str, str
+        ] = {}  # of parameters: what they are of, and where they come from
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -129,6 +135,13 @@ class FingerNode(LifecycleNode):
         if text != self._said:
             self._said = text
             self.get_logger().info(text)
+
+    def comes_from(self, what: str, path: str | Path) -> None:
+        """Say where the values of a file come from, here and on `/diagnostics`, if it says it; empty: of no file."""
+        words = "; ".join(provenance(path)) if path else ""
+        if words and self._origins.get(what) != words:
+            self.get_logger().info(f"{what} {path}: {words}")
+        self._origins[what] = words
 
     def way_on(self) -> str:
         """Return how people leave a latched fault."""
@@ -203,6 +216,7 @@ class FingerNode(LifecycleNode):
     def publish_diagnostics(self) -> None:
         """Publish the state of this node on `/diagnostics`."""
         wrong, figures = self.report()
+        figures = figures | {f"{what} from": words for what, words in self._origins.items()}
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id="piezo_gripper")
         status.level = DiagnosticStatus.ERROR if wrong else DiagnosticStatus.OK
         status.message = wrong or ("active" if self.active else "not active")
@@ -318,6 +332,9 @@ def run(*node_types: type[FingerNode]) -> int:
         for flag, path in zip(sys.argv, sys.argv[1:]):
             if flag == "--params-file":  # rcl passes over one for other nodes without a word
                 need_one_for(path, [node.get_fully_qualified_name() for node in nodes])
+                for node in nodes:
+                    if is_for(path, node.get_fully_qualified_name()):
+                        node.comes_from("parameters", path)
         for node in nodes:
             if node.get_parameter("autostart").value:
                 if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:

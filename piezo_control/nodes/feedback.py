@@ -30,7 +30,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from piezo_control.design.preview import asked
-from piezo_control.feedback import Feedback, FeedbackParameters, successor
+from piezo_control.feedback import Feedback, FeedbackParameters, controller_file, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedbackNodeParameters
@@ -189,6 +189,7 @@ class FeedbackNode(BlockNode):
         self._loading = False
         if not result.successful:
             raise ParameterError(f"{name}: {result.reason}")
+        self.comes_from("controller", controller_file(name) if name != "none" else "")
         return True
 
     def reset(self) -> None:

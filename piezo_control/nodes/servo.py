@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from piezo_control.feedback import FeedbackParameters, successor
+from piezo_control.feedback import FeedbackParameters, controller_file, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
@@ -145,6 +145,14 @@ class ServoNode(FingerNode):
             f"'{controller.name}'"
         )
         self._follow_phase()
+        self._say_origins()
+
+    def _say_origins(self) -> None:
+        p = self.parameters
+        self.comes_from(
+            "controller", controller_file(p.controller_file) if p.controller_file != "none" else ""
+        )
+        self.comes_from("feedforward", p.feedforward_file)
 
     def stop(self) -> None:
         self.drain.cancel()
@@ -166,6 +174,7 @@ class ServoNode(FingerNode):
             if controller != self.servo.feedback:
                 self.servo.change_controller(controller)
                 self.get_logger().info(f"controller '{controller.name}' takes over")
+                self._say_origins()
 
     def reset(self) -> None:
         if self.servo:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from piezo_control.feedback import read_controller, uncovered
+from piezo_control.feedback import controller_file, read_controller, uncovered
 from piezo_control.feedforward import Feedforward
 from piezo_control.identification.excitation import decaying_sine
 from piezo_control.nodes.parameters import (
@@ -167,6 +167,14 @@ class Case:
                 f"'{self.controller}': {parameters['feedback'].sample_time:g} s"
             )
         return parameters
+
+
+def parameter_files(case: Case) -> list[Path]:
+    """Return the files that the parameters of a case come from; what has none is the paper's finger."""
+    found = [case.params / f"{node}.yaml" for node in NODES if case.params]
+    if case.mode == "feedback":
+        found.append(controller_file(case.controller, case.params))
+    return [path for path in found if path.exists()]
 
 
 def own_parameters(folder: Path | None, node: str) -> dict[str, Any]:

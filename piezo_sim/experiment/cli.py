@@ -99,7 +99,11 @@ def run_into(
             known = sensorless.models_folder(folder, "truth", sensorless.CONTROLLER)
             plants = {"prandtl_ishlinskii": None, "truth": known}
             sections += [*pages, baselines.study(out / "baselines", plants, progress)]
-    sections += [results.definitions(r.figures for r in found), results.parameters(cases)]
+    sections += [
+        results.definitions(r.figures for r in found),
+        results.origins(cases),
+        results.parameters(cases),
+    ]
     verdict = paper.verdict(found)
     results.write_metrics(content, out)
     footer = results.footer(content, len(found))

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from piezo_control.parameters import flatten
+from piezo_control.parameters import flatten, provenance
 from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import QUANTITIES, Figures, analyse
-from piezo_sim.experiment.cases import NODES, Case, CaseRun
+from piezo_sim.experiment.cases import NODES, Case, CaseRun, parameter_files
 from piezo_sim.experiment.report import Section, cell
 
 MODE_TITLES = {
@@ -129,6 +129,18 @@ def parameters(cases: Sequence[Case]) -> Section:
         columns=["parameter", "value", "cases"],
         rows=rows,
         is_appendix=True,
+    )
+
+
+def origins(cases: Sequence[Case]) -> Section:
+    """Return a section that says where the parameters of the cases come from, as their files have it."""
+    paths = dict.fromkeys(path for case in cases for path in parameter_files(case))
+    rows = [["everything else", "the paper's finger (Rakotondrabe, Diouf, Lutz, IFAC 2008)"]]
+    for path in paths:
+        words = provenance(path) or ["written by hand: its head names no tool"]
+        rows += [[path.name if index == 0 else "", line] for index, line in enumerate(words)]
+    return Section(
+        "Where the parameters come from", columns=["file", "of what"], rows=rows, is_appendix=True
     )
 
 
