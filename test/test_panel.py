@@ -28,7 +28,7 @@ from piezo_control.waveform import SHAPES
 from piezo_gripper_msgs.msg import FingerState, Sample
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
-TIMEOUT = 40.0  # s, generous: the tests wait on conditions
+TIMEOUT = 180.0  # s, generous: the tests wait on conditions
 CHROMIUM = shutil.which("chromium")
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
