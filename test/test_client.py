@@ -228,7 +228,11 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
         (["control", "robst"], 1, "not one of the known"),
         (["wave", "sweep", "--amplitude-um", "1", "--frequency-hz", "1"], 2, "end_frequency is 0"),
         (["set", "1e6"], 1, "deflection is 1 m, must be within"),
-        (["lifecycle", "recorder", "deactivate"], 1, "'/finger/recorder' refuses to deactivate"),
+        (
+            ["lifecycle", "recorder", "deactivate"],
+            1,
+            "'/finger/recorder' refuses to deactivate: it is unconfigured; transition 4 is not possible",
+        ),
     ],
 )
 def test_fingerctl_says_what_is_refused(control, capsys, words, code, message):

@@ -450,6 +450,7 @@ def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     assert (process.returncode, words) == (-signal.SIGINT, "")
 
 
+@pytest.mark.shows("a signal while another one is being handled")
 def test_a_signal_between_any_two_steps_of_the_handler_of_another_is_heard(tmp_path):
     """Each line that runs while a signal is handled or waited for is interrupted by one more."""
     (tmp_path / "program.py").write_text(

@@ -4,6 +4,7 @@
 import http.client
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -394,11 +395,14 @@ def test_the_gripper_goes_where_it_is_told(page, ros):
     gripper = ros.gripper()
     page.fill("opening", "35")
     page.press("move")
-    page.shows("opening 35 µm: ", ".messages")
-    page.page.locator(".messages").filter(has_text="35.0").first.wait_for()
+    # Where it ended it says; how near that is on a busy machine is another test's.
+    page.shows(re.compile(r"opening 35 µm: .+ opening 3[45]\.\d+ µm, force"), ".messages")
     page.press("gripper_home")
     page.shows("gripper: home: ", ".messages")
     assert gripper.law.rest_opening > 0.0
+    # Fingers that hold a position feel no force, and the gripper says so.
+    page.press("grasp")
+    page.shows("goal refused: finger 'left' feels no force", ".messages .refused")
 
 
 def test_a_fault_is_shown_and_left_by_the_button(page, ros, left):

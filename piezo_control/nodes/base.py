@@ -113,6 +113,7 @@ class FingerNode(LifecycleNode):
         self.parameters: Any = build(self.PARAMETERS, self._values({}), self.NAME)
         self.active = False
         self._said = ""
+        self._refused, self._refusal = 0, ""
         self._origins: dict[
             str, str
         ] = {}  # of parameters: what they are of, and where they come from
@@ -142,6 +143,13 @@ class FingerNode(LifecycleNode):
         if words and self._origins.get(what) != words:
             self.get_logger().info(f"{what} {path}: {words}")
         self._origins[what] = words
+
+    def refuse(self, words: str) -> None:
+        """Say what is refused and why, for which the answer has no room: in the log and on `/diagnostics`."""
+        self.get_logger().error(words)
+        self._refused += 1
+        self._refusal = words
+        self.publish_diagnostics()
 
     def way_on(self) -> str:
         """Return how people leave a latched fault."""
@@ -175,7 +183,7 @@ class FingerNode(LifecycleNode):
         try:
             self.start()
         except ValueError as error:
-            self.get_logger().error(f"not activated: {error}")
+            self.refuse(f"not activated: {error}")
             return TransitionCallbackReturn.FAILURE
         self.active = True
         return super().on_activate(state)
@@ -210,13 +218,15 @@ class FingerNode(LifecycleNode):
         try:
             return super()._LifecycleNodeMixin__change_state(transition_id)  # type: ignore[misc]
         except RCLError:
-            self.get_logger().warning(f"transition {transition_id} is not possible in this state")
+            self.refuse(f"transition {transition_id} is not possible in this state")
             return TransitionCallbackReturn.FAILURE
 
     def publish_diagnostics(self) -> None:
         """Publish the state of this node on `/diagnostics`."""
         wrong, figures = self.report()
         figures = figures | {f"{what} from": words for what, words in self._origins.items()}
+        if self._refused:
+            figures |= {"refused": self._refused, "last refusal": self._refusal}
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id="piezo_gripper")
         status.level = DiagnosticStatus.ERROR if wrong else DiagnosticStatus.OK
         status.message = wrong or ("active" if self.active else "not active")

@@ -231,11 +231,25 @@ class Ros:
                     f"transition is '{transition}', must be one of {', '.join(TRANSITIONS)}"
                 )
             request = ChangeState.Request(transition=Transition(id=TRANSITIONS[transition]))
+            before = self.said(node, "refused")
             if not self.call(ChangeState, f"{node}{CHANGE_STATE}", request).success:
                 raise ClientError(
-                    f"'{node}' refuses to {transition}: it is {self.lifecycle(node)}; its log says why"
+                    f"'{node}' refuses to {transition}: it is {self.lifecycle(node)}; {self.why(node, before)}"
                 )
         return self.meet(node)
+
+    def said(self, node: str, key: str) -> str:
+        """Return what a node says of itself on `/diagnostics` under a key; empty: nothing."""
+        status = self.diagnostics.get(node)
+        return next((f.value for f in status.values if f.key == key), "") if status else ""
+
+    def why(self, node: str, before: str) -> str:
+        """Return why a node has just refused something; `before` is what it said under `refused` before that."""
+        self.wait(
+            lambda: self.said(node, "refused") != before,
+            lambda: f"'{node}' refuses, and does not say why",
+        )
+        return self.said(node, "last refusal")
 
     def parameters(self, node: str) -> dict[str, Any]:
         """Return all parameters of a node."""
@@ -380,11 +394,12 @@ class Gripper:
         self.ros.wait(self._grip.server_is_ready, lambda: f"'{self.node}' has no action 'grip'")
         self.ros.meet(self.node)
         goal = Grip.Goal(opening=opening, max_force=max_force, speed=speed)
+        before = self.ros.said(self.node, "refused")
         handle = self.ros.ask(
             self.node, self._grip.send_goal_async, goal, lambda m: on_feedback(m.feedback)
         )
         if not handle.accepted:
-            raise ClientError(f"'{self.node}' refuses this goal; its log says why")
+            raise ClientError(f"'{self.node}': {self.ros.why(self.node, before)}")
         try:
             return self.ros.ask(self.node, handle.get_result_async, timeout=timeout).result
         except BaseException:

@@ -72,7 +72,7 @@ class ActionFace:
         try:
             self.gripper.check_goal(*self.wanted(request))
         except ValueError as error:
-            self.gripper.get_logger().error(f"goal refused: {error}")
+            self.gripper.refuse(f"goal refused: {error}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
