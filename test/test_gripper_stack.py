@@ -2,6 +2,7 @@
 """A whole simulated gripper by one command, driven by the client class and by `fingerctl`."""
 
 import io
+import re
 import signal
 import subprocess
 from pathlib import Path
@@ -74,8 +75,11 @@ def test_fingerctl_grips_and_says_how_it_ended(ros, capsys):
         return fingerctl.carry_out(ros, arguments, Console(file=text, width=120))
 
     assert run("38") == 0
-    assert text.getvalue().startswith("there: opening 38.")
     assert run("10", "--force-mn", "0.5") == 0
-    assert "stopped before: opening 29.6" in text.getvalue()
+    ways, openings = zip(*re.findall(r"(.+): opening (\S+) µm, force", text.getvalue()))
+    assert ways == ("there", "stopped before")
+    pressed = DEFAULTS.rest_opening - 2 * (FREE_PLAY + FORCE / STIFFNESS)
+    near = DEFAULTS.tolerance * 1e6
+    assert [float(o) for o in openings] == pytest.approx([38.0, pressed * 1e6], abs=near)
     assert run("200") == 1
     assert "'/cell/gripper': opening is 0.0002, must be in" in capsys.readouterr().err
