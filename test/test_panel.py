@@ -227,7 +227,7 @@ class Page:
         self.page.locator(where).filter(has_text=text).first.wait_for()
 
     def ask(self, question):
-        """Return what a function in the browser returns, once a page is there.
+        """Return what a function in the browser returns, once a page is there and that is true.
 
         It is opened anew whenever the panel has found more to show, and then asked again.
         """
@@ -319,7 +319,7 @@ def test_set_point_moves_the_finger_and_its_trace(page, left):
     page.press("go")
     left.wait_for(near(left, 6.5e-6))
     page.shows("/left: set-point 6.5 µm: done", ".messages")
-    page.page.wait_for_function(
+    page.ask(
         """() => Math.abs(
             Bokeh.documents[0].get_model_by_name("source/left").data.deflection.at(-1) - 6.5) < 0.1"""
     )
@@ -448,7 +448,7 @@ def test_without_control_there_is_nothing_to_drive_with(onlooker, browser, left)
     )
     assert {"set_point", "stop", "go", "wave"} & set(names) == set()
     later = page.trace("/left")["clock"][-1] + 1.0
-    page.page.wait_for_function(
+    page.ask(
         f"""() => Bokeh.documents[0].get_model_by_name("source/left").data.clock.at(-1) > {1e3 * later}"""
     )
     assert page.errors == []
