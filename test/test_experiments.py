@@ -17,7 +17,7 @@ from rosbags.highlevel import AnyReader
 from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
 from piezo_control.shared import version
-from piezo_sim.experiment import cli, paper, results
+from piezo_sim.experiment import cli, paper, results, study
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
 from piezo_sim.experiment.cases import (
     multisine,
@@ -493,3 +493,18 @@ def test_what_a_certificate_does_not_cover_is_said(tmp_path):
     assert not_covered(read_experiment("step", {"controller": "robust"})[1]) == []
     paper = not_covered(read_experiment("step", {"controller": "paper"})[1])
     assert paper == ["controller 'paper': it is not certified"]
+
+
+def test_a_study_that_is_stopped_says_so_and_replaces_nothing(tmp_path, capsys):
+    out = tmp_path / "grasp"
+    out.mkdir()
+    (out / "report.html").write_text("of before")
+
+    def work(arguments, folder, console):
+        (folder / "report.html").write_text("half of the next")
+        raise KeyboardInterrupt
+
+    arguments = study.parser("grasp", "A study.").parse_args(["--out", str(out), "--overwrite"])
+    assert study.run(arguments, "A study", work) == 1
+    assert f"grasp: stopped; what was there before in {out} is unchanged" in capsys.readouterr().err
+    assert (out / "report.html").read_text() == "of before"
