@@ -91,9 +91,15 @@ def serialized(bag: Path, name: str) -> list[tuple[int, bytes]]:
 
 def test_two_runs_of_one_seed_are_byte_equal(twin_runs):
     first, second, *_ = (run.bag for run in twin_runs)
+    end = serialized(first, "deflection")[-1][0]
+
+    def of_the_run(bag, topic):
+        # Temperatures travel ahead; how many of those after the end a recorder still hears is chance.
+        return [(instant, data) for instant, data in serialized(bag, topic) if instant <= end]
+
     for topic in (*LOOP, "temperature"):
-        samples = serialized(first, topic)
-        assert samples == serialized(second, topic)
+        samples = of_the_run(first, topic)
+        assert samples == of_the_run(second, topic)
     assert len(samples) >= 60  # the temperature's grid is 1 ms, the run lasts 60 ms
 
 

@@ -272,7 +272,10 @@ class FeedforwardNode(BlockNode):
         value = self.guard.voltage(limits(p, p.ramp), self.law.voltage, elapsed)
         if value == self.law.voltage:
             return
-        voltage = Sample(number=self.last.number, value=value, period=p.sample_time)
+        # In lock-step the answer before it may be lost, and the way to rest is no answer: it takes milliseconds, not
+        # samples. So it has the number of the sample before, which nobody waits for.
+        number = self.last.number if p.mode == "free_running" else max(0, self.sequence.next - 2)
+        voltage = Sample(number=number, value=value, period=p.sample_time)
         voltage.header.stamp = self.last.header.stamp
         if p.mode == "free_running":
             voltage.header.stamp = base.system_time()
