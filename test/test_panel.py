@@ -8,6 +8,7 @@ import re
 import shutil
 import signal
 import subprocess
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -231,8 +232,19 @@ class Page:
 
         It is opened anew whenever the panel has found more to show, and then asked again.
         """
+        from playwright.sync_api import Error
+
         is_there = "window.Bokeh?.documents[0]?.get_model_by_name('cards')"
-        return self.page.wait_for_function(f"() => {is_there} && ({question})()").json_value()
+        end = time.monotonic() + TIMEOUT
+        while time.monotonic() < end:
+            try:
+                if answer := self.page.evaluate(f"() => {is_there} && ({question})()"):
+                    return answer
+            except Error as error:
+                if "navigation" not in str(error):
+                    raise
+            self.page.wait_for_timeout(100)
+        raise AssertionError(f"never true: {question}")
 
     def trace(self, finger):
         """Return what is drawn of a finger's signals, in their units, and the times in s."""

@@ -125,8 +125,8 @@ class Bench:
 
     def parts(self) -> tuple[Any, ...]:
         """Return what a page is made for: it is opened anew when that has changed."""
-        figures = known(self.histories.values())
-        return tuple(self.fingers), figures, self.gripper is not None, self.reach()
+        driven = (self.gripper is not None, self.reach()) if self.control else ()
+        return tuple(self.fingers), known(self.histories.values()), driven
 
     def reach(self) -> tuple[float, float]:
         """Return the lowest and highest command (m) that every finger follows."""
