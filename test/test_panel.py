@@ -227,24 +227,28 @@ class Page:
         """Wait until a part of the page shows a text."""
         self.page.locator(where).filter(has_text=text).first.wait_for()
 
-    def ask(self, question):
-        """Return what a function in the browser returns, once a page is there and that is true.
+    def again(self, look):
+        """Return what `look()` finds on the page, once it finds something.
 
-        It is opened anew whenever the panel has found more to show, and then asked again.
+        The page is opened anew whenever the panel has found more to show, and is then looked at again.
         """
         from playwright.sync_api import Error
 
-        is_there = "window.Bokeh?.documents[0]?.get_model_by_name('cards')"
         end = time.monotonic() + TIMEOUT
         while time.monotonic() < end:
             try:
-                if answer := self.page.evaluate(f"() => {is_there} && ({question})()"):
-                    return answer
+                if found := look():
+                    return found
             except Error as error:
                 if "navigation" not in str(error):
                     raise
             self.page.wait_for_timeout(100)
-        raise AssertionError(f"never true: {question}")
+        raise AssertionError("nothing was found on the page")
+
+    def ask(self, question):
+        """Return what a function in the browser returns, once a page is there and that is true."""
+        is_there = "window.Bokeh?.documents[0]?.get_model_by_name('cards')"
+        return self.again(lambda: self.page.evaluate(f"() => {is_there} && ({question})()"))
 
     def trace(self, finger):
         """Return what is drawn of a finger's signals, in their units, and the times in s."""
@@ -452,7 +456,7 @@ def test_without_control_there_is_nothing_to_drive_with(onlooker, browser, left)
     page = Page(browser.new_context(), onlooker.address)
     page.shows("read-only")
     page.shows("/left", ".cards")
-    buttons = page.ask("() => Array.from(document.querySelectorAll('button'), b => b.innerText)")
+    buttons = page.again(page.page.get_by_role("button").all_inner_texts)
     assert set(buttons) <= {"10 s", "1 min", "10 min", "Freeze"}
     # Nor is there anything in the server that a page made by hand could speak to.
     names = page.ask(
