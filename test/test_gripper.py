@@ -241,6 +241,11 @@ class Bench:
         assert handle.accepted, self.log.read_text()
         return self.result_of(handle.get_result_async())
 
+    def is_open(self):
+        """Say whether the gripper goes to the opening of a gripper at rest when it is asked to."""
+        handle = self.send(40e-6)
+        return handle.accepted and self.result_of(handle.get_result_async()).result.reached_goal
+
     def moving(self, handle):
         """Wait until a goal is on its way to an opening of 10 µm, 60 s away."""
         assert handle.accepted, self.log.read_text()
@@ -260,8 +265,8 @@ def started(folder, state_timeout=4.0, speed=DEFAULTS.speed):
     try:
         bench.wait(lambda: len(bench.states) == 2 and bench.client.server_is_ready())
         bench.wait(lambda: all(s.phase == FingerState.RUNNING for s in bench.states.values()))
-        # The gripper has to have met the fingers too; until then it refuses.
-        bench.wait(lambda: bench.send(40e-6).accepted)
+        # The gripper has to have met the fingers too, and felt them; until then it refuses or gives up.
+        bench.wait(bench.is_open)
         yield bench
     finally:
         codes = bench.close()
