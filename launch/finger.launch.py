@@ -43,15 +43,19 @@ def nodes(context: LaunchContext) -> list[Node]:
     feels = given["force_control"].lower() == "true"
     sampled = {"mode": given["mode"], "sample_time": float(given["sample_time"])}
     controller = ParameterValue(given["controller"], value_type=str)
+    simulated = given["plant"] == "simulated"
+    models = {"compensator": "sensorless", "temperature_lockstep": simulated}
     parameters = {
-        "feedforward": sampled | {"compensator": "sensorless" if feels else "inverse"},
+        "feedforward": sampled | (models if feels else {"compensator": "inverse"}),
         "feedback": {
             "mode": given["mode"],
             "controller_file": controller,
             "force_control": feels,
         },
     }
-    if given["plant"] == "simulated":
+    if given["controller"] == "none":
+        parameters["feedback"] |= sampled
+    if simulated:
         period = {"state_period": float(given["state_period"]), "temperature_lockstep": True}
         parameters |= {"cantilever": sampled | period, "temperature": {"mode": given["mode"]}}
     if given["record"].lower() == "true":

@@ -3,6 +3,7 @@
 
 A sample numbered one more than the last is new. The last number again is a request to repeat the answer.
 Number 0 begins a run. Anything else is stray: it is not answered, and the count goes on as if it had not come.
+Where numbers may be left out, a few stray ones that rise are a count that began anew, and go on as such.
 """
 
 from __future__ import annotations
@@ -28,11 +29,14 @@ class Sequence:
     """
 
     LARGEST_GAP = 10**7
+    RISING = 3
+    """So many stray numbers that rise begin a new run, with `gaps`."""
 
     def __init__(self, gaps: bool = False) -> None:
         self.gaps = gaps
         self.next = -1
         """Number of the sample that comes next; -1 before the first one."""
+        self._strays: list[int] = []
 
     def classify(self, number: int) -> int:
         """Return NEW, REPEATED, FIRST or STRAY; nothing is counted yet."""
@@ -49,3 +53,14 @@ class Sequence:
     def count(self, number: int) -> None:
         """Take note that sample `number` was answered."""
         self.next = number + 1
+        self._strays.clear()
+
+    def begins_anew(self, number: int) -> bool:
+        """Take note of a stray sample, and say whether a new run began: then the count is at this one."""
+        if self._strays and number <= self._strays[-1]:
+            self._strays.clear()
+        self._strays.append(number)
+        if not self.gaps or len(self._strays) < self.RISING:
+            return False
+        self.count(number - 1)
+        return True

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 LOOK_PERIOD = 0.02  # s, between two looks at whether a signal came
 
 
@@ -39,6 +40,22 @@ class Stop:
         return self._is_set
 
 
+def interrupt_at_signals() -> None:
+    """Raise KeyboardInterrupt at the first signal that ends a program, and ignore those that follow.
+
+    For what waits for answers and computes for long between its movements; `finally` leads the finger to rest.
+    """
+
+    def interrupt(*_: Any) -> None:
+        for number in caught:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    caught = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+    for number in caught:
+        signal.signal(number, interrupt)
+
+
 def stop_at_signals() -> Stop:
     """Return what the signals that end a program set; call from the main thread.
 
@@ -46,7 +63,7 @@ def stop_at_signals() -> Stop:
     while Python ends: it gives them back their default, and a second signal would turn a good end into a death.
     """
     stop = Stop()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
+    for number in ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, stop.set)
             atexit.register(signal.signal, number, signal.SIG_IGN)

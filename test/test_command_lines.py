@@ -113,6 +113,25 @@ def options(main, commands):
     )
 
 
+@pytest.mark.parametrize(
+    "option, value, allowed",
+    [
+        ("--slew-limit", "nan", "[0.001, 1e+06]"),
+        ("--slew-limit", "1e9", "[0.001, 1e+06]"),
+        ("--voltage-high", "5000", "[-1000, 1000]"),
+        ("--voltage-low", "50", "below 'voltage_high'"),
+        ("--rest-voltage", "inf", "[-1000, 1000]"),
+        ("--share", "10", "[0.001, 1]"),
+        ("--share", "nan", "[0.001, 1]"),
+        ("--sample-time", "0", "[1e-06, 0.1]"),
+    ],
+)
+def test_what_no_finger_stands_is_refused_before_it_moves(files, option, value, allowed):
+    code, said, _ = run(commission.main, [f"{option}={value}", "--yes"])
+    assert code == 2
+    assert allowed in said and value.removesuffix("e9") in said, said
+
+
 COMMANDS = {
     "experiment": (experiment.main, [["step"], ["all"], ["analyse"], ["compare"], ["recover"], []]),
     "identify": (

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
@@ -18,6 +19,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
@@ -117,15 +119,14 @@ def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
 
 
 def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighbour, tmp_path):
+    """It does not answer before it has heard what that is, where somebody can tell."""
     states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
-    states.publish(FingerState(phase=FingerState.RUNNING, samples=1000, voltage=36.9))
-    with node("feedforward", tmp_path, autostart=False, mode="free_running"):
+    with node("feedforward", tmp_path, mode="free_running"):
         voltages = neighbour.listen(Sample, "voltage")
-        neighbour.wait(lambda: states.get_subscription_count() > 0)
-        assert states.wait_for_all_acked()
-        assert neighbour.change_state("feedforward", Transition.TRANSITION_CONFIGURE)
-        assert neighbour.change_state("feedforward", Transition.TRANSITION_ACTIVATE)
         Stream(neighbour, "command", 0.0)
+        neighbour.wait(lambda: "waits for '/state'" in log(tmp_path, "feedforward"))
+        assert not voltages
+        states.publish(FingerState(phase=FingerState.RUNNING, samples=1000, voltage=36.9))
         neighbour.wait(lambda: voltages)
     assert abs(voltages[0].value - 36.9) <= SLEW * (1 + 1e-9)
 
@@ -300,6 +301,13 @@ def test_a_controller_changes_as_a_whole_or_not_at_all(neighbour, tmp_path):
         )
         results = neighbour.ask(SetParameters, "feedback/set_parameters", request).results
         assert any("changes as a whole" in r.reason for r in results)
+        # All at once, they are a controller that nobody has certified.
+        for value in (True, False):
+            answer = neighbour.set("feedback", **{**second, "certified": value})
+            assert answer.successful is not value
+            assert value is False or "bring no certificate" in answer.reason
+        assert neighbour.set("feedback", controller_file="paper").successful
+        neighbour.wait(lambda: neighbour.get("feedback", "name") == "paper")
         assert neighbour.get("feedback", "name") == "paper"
         assert list(neighbour.get("feedback", "a")) == list(before)
         path = tmp_path / "b.yaml"
@@ -321,6 +329,34 @@ def test_a_changed_parameter_is_used_before_the_first_sample(neighbour, tmp_path
         neighbour.tell("feedback", reference, sample(0, 10e-6))
         neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
     assert commands[0].value == 5e-6
+
+
+def test_a_reset_of_a_feedback_that_runs_changes_nothing(neighbour, tmp_path):
+    with node("feedback", tmp_path, "feedback_robust.yaml"):
+        commands = neighbour.listen(Sample, "command")
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        neighbour.tell("feedback", reference, sample(0, 20e-6))
+        neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
+        for number in range(1, 40):
+            deflection.publish(sample(number, 1e-6))
+            neighbour.wait(lambda n=number: commands[-1].number == n)
+            if number == 20:
+                assert reset(neighbour, "feedback").success
+    steps = np.abs(np.diff([c.value for c in commands[1:]]))
+    assert steps[18:22].max() <= 2.0 * steps[10:18].max()
+
+
+def test_a_loop_that_runs_free_follows_a_count_that_begins_anew(neighbour, tmp_path):
+    """As of a driver that was started again: numbers from 1 on after thousands."""
+    with node("feedback", tmp_path, mode="free_running"):
+        commands = neighbour.listen(Sample, "command")
+        stream = Stream(neighbour, "deflection", 1e-6)
+        stream.numbers = itertools.count(5000)
+        neighbour.wait(lambda: commands and commands[-1].number > 5000)
+        stream.numbers = itertools.count(1)
+        neighbour.wait(lambda: 1 < commands[-1].number < 1000)
+    assert "counts anew" in log(tmp_path, "feedback")
 
 
 def test_an_uncertified_controller_is_said_loudly(neighbour, tmp_path):
@@ -369,6 +405,18 @@ def test_a_free_cantilever_latches_and_moves_with_the_wall_clock(neighbour, tmp_
     behind = [t - d.number * d.period for t, d in zip(stamps, deflections)]
     assert max(behind) - min(behind) < 0.3
     assert deflections[-1].number > len(deflections) + 50  # the halt is in the numbers
+
+
+def test_a_free_cantilever_does_not_act_upon_an_old_voltage(neighbour, tmp_path):
+    with node("cantilever", tmp_path, mode="free_running", sample_time=0.005):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        old = Stream(neighbour, "voltage", 30.0)
+        old.fields = {"header": Header(stamp=base.wall_time(time.monotonic() - 2.0))}
+        neighbour.wait(lambda: "s old, must be at most 0.05 s" in log(tmp_path, "cantilever"))
+        old.fields = {}
+        old.value = 10.0
+        neighbour.wait(lambda: states and states[-1].voltage == 10.0)
+    assert max(s.voltage for s in states) == 10.0
 
 
 def test_a_wild_voltage_neither_moves_the_tip_nor_goes_unnoticed(neighbour, tmp_path):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Numbered samples: whatever comes in between, each is answered once and in order."""
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,6 +27,17 @@ def test_zero_begins_again():
     for number in (0, 1, 2):
         sequence.count(number)
     assert sequence.classify(0) == FIRST
+
+
+@given(st.integers(100, 10**9), st.lists(st.integers(1, 5), min_size=3, max_size=3))
+def test_a_count_that_begins_anew_is_followed_where_numbers_may_be_left_out(before, steps):
+    for gaps in (True, False):
+        sequence = Sequence(gaps)
+        sequence.count(before)
+        numbers = list(np.cumsum(steps))
+        sequence.begins_anew(2**64 - 1)  # another stray one in between is no beginning
+        assert [sequence.begins_anew(int(n)) for n in numbers] == [False, False, gaps]
+        assert sequence.classify(int(numbers[-1])) == (NEW if gaps else STRAY)
 
 
 @given(st.lists(st.integers(1, 1000), max_size=40))

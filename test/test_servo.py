@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The servo: its law against the engine, every guard on its cause, the loop in real time, the node."""
 
+import argparse
 import ctypes
 import json
 import math
+import os
 import signal
 import subprocess
 import sysconfig
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -30,8 +33,8 @@ from piezo_control.nodes.profile_input import waveform_message
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.parameters import ParameterError, dump, load
 from piezo_control.profile import Profile
-from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING
-from piezo_control.servo import law
+from piezo_control.safety import FAULT, HOLDING, NORMAL, RAMPING, VoltageParameters
+from piezo_control.servo import commission, law
 from piezo_control.servo.commission import PROBLEM, at_its_pace
 from piezo_control.servo.driver import (
     FAILED,
@@ -44,6 +47,7 @@ from piezo_control.servo.driver import (
 from piezo_control.servo.law import laws_of, put_controller, servo_step, settings_of, watch_at_rest
 from piezo_control.servo.loop import Servo
 from piezo_control.servo.parameters import ServoParameters
+from piezo_control.start import ENDING, interrupt_at_signals
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
@@ -391,6 +395,73 @@ def test_a_servo_in_this_process():
     assert (servo.phase, servo.cause, voltage[-1]) == (FAULT, "stopped", 0.0)
 
 
+def test_a_signal_in_the_midst_of_commissioning_ends_at_rest(monkeypatch):
+    """Beyond 15 V on the way up; the second signal, while the voltage is led to rest, changes nothing."""
+    servos = []
+
+    class Seen(Servo):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            servos.append(self)
+
+    def interrupt():
+        wait(
+            lambda: servos and servos[0]._loop.watch.phase[0] == NORMAL and servos[0].voltage > 15.0
+        )
+        os.kill(os.getpid(), signal.SIGTERM)
+        wait(lambda: servos[0]._loop.orders.stop[0] == 1)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(commission, "Servo", Seen)
+    arguments = argparse.Namespace(
+        sample_time=H, write="immediately", amplifier_gain=1.0, driver="simulated", driver_options="",
+        priority=0,
+    )  # fmt: skip
+    bench = commission.Bench(arguments, VoltageParameters(), 1.0)
+    before = {number: signal.getsignal(number) for number in ENDING}
+    interrupt_at_signals()
+    other = threading.Thread(target=interrupt)
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            bench.move(Profile([0.0, 10.0], [0.0, 30.0], linear=True), 10.0)
+    finally:
+        other.join()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert (servos[0].phase, servos[0].voltage) == (FAULT, 0.0)
+    voltage = servos[0].samples().voltage
+    assert voltage.max() > 15.0 and np.abs(np.diff(voltage)).max() <= 4.0 + 1e-9
+
+
+def test_controllers_of_a_finger_at_rest_change_as_often_as_one_likes():
+    servo = Servo(Simulation("", H), PATIENT, ROBUST, FeedforwardParameters())
+    servo.start()
+    try:
+        wait(lambda: servo.number > 100)
+        servo.give_up_without_temperature()
+        wait(lambda: servo.phase == FAULT)
+        for controller in (PAPER, ROBUST, PAPER):
+            servo.check_controller(controller)
+            servo.change_controller(controller)
+        servo.reset()
+        wait(lambda: servo._loop.watch.in_use[0] == servo._loop.orders.controller[0])
+        in_use = servo._loop.laws.controllers[int(servo._loop.watch.in_use[0])]
+        assert in_use.command_high[0] == PAPER.command_high and in_use.order[0] == PAPER.order
+        large = replace(
+            ROBUST,
+            a=(0.0,) * 33**2,
+            b=(0.0,) * 33,
+            c=(0.0,) * 33,
+            anti_windup=(0.0,) * 33,
+            reference_b=(0.0,) * 33,
+        )
+        with pytest.raises(ParameterError, match="33 states, must have at most 32"):
+            servo.check_controller(large)
+    finally:
+        servo.stop()
+
+
 def test_a_device_that_is_not_there_is_named(tmp_path):
     with pytest.raises(
         ParameterError, match="must be 'simulated', one of the shipped iio, udp, or the path"
@@ -541,6 +612,30 @@ def stand(tmp_path):
     assert set(codes) == {0}
 
 
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_to_commission_leads_the_voltage_to_rest(stand, end):
+    """As soon as it goes on to the sine over the whole range; `SIGINT` twice, as of one who is in a hurry."""
+    out = stand.folder / "commissioned"
+    commission = stand.start(
+        "commission", "--driver", "udp", "--driver-options", f"127.0.0.1:{stand.port}", "--write", "next_edge",
+        "--sensor-scale", "2e-5", "--rest-voltage", "10", "--yes", "--out", str(out),
+    )  # fmt: skip
+    wait(lambda: "resonance" in stand.log("commission"))
+    commission.send_signal(end)
+    if end == signal.SIGINT:
+        commission.send_signal(end)
+    assert commission.wait(TIMEOUT) == 1
+    assert "ended by a signal" in stand.log("commission")
+    assert "Traceback" not in stand.log("commission")
+    stand.finger.terminate()
+    assert stand.finger.wait(TIMEOUT) == 0
+    report = json.loads((stand.folder / "report.json").read_text())
+    assert report["last_voltage"] == 10.0
+    if not report["lost_datagrams"]:
+        assert report["largest_step"] <= 4.0 + 1e-9
+    assert not (out / "servo.yaml").exists()
+
+
 def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     found = stand.commission()
     servo = load(found / "servo.yaml", "servo")
@@ -584,6 +679,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
         assert answer.results[0].successful == taken
     assert "not one of the known" in answer.results[0].reason
     stand.wait(lambda: "controller 'paper' takes over" in stand.log("servo"))
+    assert "controller 'paper' (paper): it is not certified" in stand.log("servo")
     # The finger dies: held, then at rest with a fault that names it, until a reset.
     stand.finger.kill()
     stand.finger.wait()

@@ -139,6 +139,12 @@ def test_a_finger_in_real_time_stops_at_a_wall(tmp_path):
         device = servo.driver.device
         assert -device.state.tip_force[0] == pytest.approx(LIMIT, abs=0.08e-3)
         assert max(pushes) < 1.3 * LIMIT
+        # A reset of a finger that runs leaves nothing, least of all the knowledge of how hard it pushes.
+        for _ in range(3):
+            servo.reset()
+            number = servo.number
+            wait(lambda after=number + 200: servo.look_ahead() or servo.number > after)
+        assert -device.state.tip_force[0] == pytest.approx(LIMIT, abs=0.08e-3)
         servo.give_up_without_temperature()
         wait(lambda: servo.phase == FAULT)
         assert servo.cause == "the temperature is missing or frozen"

@@ -19,10 +19,11 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from piezo_control.export.firmware import firmware, objections, write
+from piezo_control.export.firmware import firmware, write
 from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
 from piezo_control.parameters import ParameterError, build, load
+from piezo_control.servo.law import objections
 
 
 def main() -> int:
@@ -52,6 +53,10 @@ def make(arguments: argparse.Namespace) -> dict[str, str]:
         if (value := getattr(arguments, kind)) is not None
     }
     p = replace(p, **named)
+    if p.force_control:
+        raise ParameterError(
+            f"{path}: 'force_control' is true, and the law that limits a force is not exported"
+        )
     controller = successor(p.controller_file, FeedbackParameters())
     feedforward = read_feedforward(p)
     if arguments.sample_time is not None and arguments.sample_time != controller.sample_time:

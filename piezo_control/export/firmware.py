@@ -19,7 +19,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from piezo_control import safety
 from piezo_control.export.vectors import vectors
-from piezo_control.feedback import FeedbackParameters, feedback_coefficients, hand_over, uncovered
+from piezo_control.feedback import FeedbackParameters, feedback_coefficients, hand_over
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError
 from piezo_control.servo import driver, law
@@ -39,12 +39,6 @@ NAMES = {
         )
     },
 }  # fmt: skip
-
-
-def objections(feedback: FeedbackParameters, feedforward: FeedforwardParameters) -> list[str]:
-    """Return what speaks against running the controller on this finger, in words; empty: nothing."""
-    reach = Feedforward(feedforward, feedback.sample_time).reachable_range
-    return uncovered(feedback, feedback.delay_samples, feedback.denominator, reach)
 
 
 def firmware(

@@ -46,6 +46,15 @@ def wrong_time(sample: Sample, topic: str, parameters: Any, name: str) -> str:
     return ""
 
 
+def too_old(sample: Sample, topic: str, age_limit: float) -> str:
+    """Say that a sample is older than `age_limit` (s), if its stamp says so; empty: it is not."""
+    stamp = seconds(sample.header.stamp)
+    age = time.time() - stamp
+    if not stamp or age <= age_limit:
+        return ""
+    return f"'{topic}' sample {sample.number} is {age:.2g} s old, must be at most {age_limit:g} s; not acted upon"
+
+
 class BlockNode(FingerNode):
     """Subscribe `INPUT`, publish `OUTPUT`; a subclass says what becomes of a value."""
 
@@ -164,7 +173,12 @@ class BlockNode(FingerNode):
         if kind == REPEATED and lockstep:
             self.answers.publish(self.last)
             return
-        if kind == STRAY or kind == REPEATED:
+        if kind == STRAY and self.sequence.begins_anew(number):
+            self.get_logger().warning(
+                f"'{self.INPUT}' counts anew, from sample {number} on: a new run"
+            )
+            self.restart()
+        elif kind == STRAY or kind == REPEATED:
             self.get_logger().error(
                 f"'{self.INPUT}' brought sample {number}, expected {max(self.sequence.next, 0)}: "
                 "does another node answer this topic?",
@@ -195,13 +209,8 @@ class BlockNode(FingerNode):
                 throttle_duration_sec=1.0,
             )
             return
-        stamp = seconds(sample.header.stamp)
-        if not lockstep and stamp and time.time() - stamp > self.parameters.age_limit:
-            self.get_logger().error(
-                f"'{self.INPUT}' sample {number} is {time.time() - stamp:.2g} s old, must be at most "
-                f"{self.parameters.age_limit:g} s; not acted upon",
-                throttle_duration_sec=1.0,
-            )
+        if not lockstep and (old := too_old(sample, self.INPUT, self.parameters.age_limit)):
+            self.get_logger().error(old, throttle_duration_sec=1.0)
             return
         if lockstep and (missing := self.prepare(sample)):
             self._waiting = sample, missing

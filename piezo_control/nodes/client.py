@@ -2,8 +2,7 @@
 """Running fingers and grippers from Python, without a node of one's own and without the `ros2` command.
 
     from piezo_control.nodes.client import connect
-    from piezo_control.start import LOOK_PERIOD, Stop
-from piezo_control.waveform import Waveform
+    from piezo_control.waveform import Waveform
 
     with connect() as ros:
         finger = ros.finger("finger")
@@ -592,7 +591,8 @@ class Finger:
         values = self.ros.parameters(follower)
         if follower == limiter:
             servo = build(ServoNodeParameters, own(ServoNodeParameters, values), follower)
-            feedback = flatten(successor(servo.controller_file, FeedbackParameters()))
+            controller = flatten(successor(servo.controller_file, FeedbackParameters()))
+            feedback = {**flatten(servo), **controller}
             feedforward = flatten(read_feedforward(servo))
         else:
             feedback, feedforward = values, self.ros.parameters(limiter)

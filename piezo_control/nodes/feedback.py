@@ -106,6 +106,11 @@ class FeedbackNode(BlockNode):
             raise ParameterError(
                 "'name': a controller changes as a whole, by 'controller_file' or in one atomic request"
             )
+        if changed and not self._loading and parameters.certified:
+            raise ParameterError(
+                "'certified' is true: single parameters bring no certificate; take the controller by "
+                "'controller_file', or set 'certified' to false with them"
+            )
         if self.active:
             self._started(parameters)
 
@@ -144,7 +149,12 @@ class FeedbackNode(BlockNode):
             )
             # A finger that has this topic is taken for one that feels.
             self._pushes = self.create_publisher(Sample, "push", SAMPLE)
-        elif p.controller != "none" and not p.certified:
+        self._warn()
+
+    def _warn(self) -> None:
+        """Say that a controller that is to run has no certificate."""
+        p = self.parameters
+        if p.controller != "none" and not (p.certified or p.force_control):
             self.get_logger().warning(
                 f"controller '{p.name}' ({p.controller_file or 'from parameters'}) is not certified: nothing "
                 "says that the loop is stable with this finger"
@@ -159,7 +169,10 @@ class FeedbackNode(BlockNode):
     def apply(self) -> None:
         if not self._take_file():
             p = self.parameters
-            self.law = self._started(p)
+            law = self._started(p)
+            if self.active and law.parameters.name != self.law.parameters.name:
+                self._warn()
+            self.law = law
             state = self.touch.state
             self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
             self.touch.state = state
@@ -193,8 +206,10 @@ class FeedbackNode(BlockNode):
         return True
 
     def reset(self) -> None:
+        was_latched = self.guard.is_latched
         super().reset()
-        self.restart_law()
+        if was_latched:  # a finger that runs goes on as it is
+            self.restart_law()
 
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()

@@ -43,7 +43,7 @@ from piezo_control.safety import (
 from piezo_control.sensorless import Sensorless
 from piezo_control.sequence import grid_index
 from piezo_control.thermometer import Thermometer
-from piezo_gripper_msgs.msg import Sample
+from piezo_gripper_msgs.msg import FingerState, Sample
 
 
 class FeedforwardNode(BlockNode):
@@ -92,6 +92,20 @@ class FeedforwardNode(BlockNode):
                 )
         if self.parameters.mode == "free_running":
             self.watchdog.reset()
+
+    def _on_state(self, state: FingerState) -> None:
+        is_first = self.finger is None
+        super()._on_state(state)
+        if is_first and self.active and self.sequence.next < 0:
+            self._build(state.voltage)
+
+    def _on_sample(self, sample: Sample) -> None:
+        is_lockstep = self.parameters.mode == "lockstep"
+        if is_lockstep or self._answers or self.finger or not self.count_publishers("state"):
+            super()._on_sample(sample)
+        else:
+            # Another process may have moved the finger before this one.
+            self.say(f"waits for '{self.resolve_topic_name('state')}': the voltage that is applied")
 
     def restart(self) -> None:
         """Begin with a homed finger at the voltage that is applied, or else at the last one."""

@@ -32,6 +32,12 @@ class LoopParameters:
         low=0,
         high=100,
     )
+
+
+@dataclass(frozen=True)
+class BlockParameters(LoopParameters):
+    """How a node takes samples from a loop."""
+
     age_limit: float = parameter(
         0.05,
         "running free: an input older than this is not acted upon",
@@ -43,7 +49,7 @@ class LoopParameters:
 
 @dataclass(frozen=True)
 class FeedforwardNodeParameters(
-    FeedforwardParameters, SensorlessParameters, LoopParameters, SafetyParameters
+    FeedforwardParameters, SensorlessParameters, BlockParameters, SafetyParameters
 ):
     """The laws' parameters and the node's own."""
 
@@ -66,7 +72,7 @@ class FeedforwardNodeParameters(
 
 
 @dataclass(frozen=True)
-class FeedbackNodeParameters(FeedbackParameters, LoopParameters):
+class FeedbackNodeParameters(FeedbackParameters, BlockParameters):
     """The law's parameters and the node's own."""
 
     controller_file: str = parameter(

@@ -103,7 +103,7 @@ class ProfileInput:
             waveform.header = header
             self._waveforms.publish(waveform)
         elif isinstance(signal, Profile):
-            profile = to_message(signal)
+            profile = to_message(signal, 0.0 if math.isinf(self.max_force) else self.max_force)
             profile.header = header
             self._profiles.publish(profile)
 

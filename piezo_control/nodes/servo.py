@@ -41,7 +41,7 @@ from piezo_control.safety import (
 )
 from piezo_control.servo.clock import lateness_quantile
 from piezo_control.servo.driver import DriverError, open_driver
-from piezo_control.servo.law import feeling_of
+from piezo_control.servo.law import feeling_of, objections
 from piezo_control.servo.loop import Samples, Servo
 from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
@@ -85,47 +85,68 @@ class ServoNode(FingerNode):
         return names - {"controller_file", "preview_band", "tolerance", "sample_period"}
 
     def check(self, parameters: ServoNodeParameters) -> None:
-        if parameters.controller_file != self.parameters.controller_file or not self.active:
-            controller = self._controller(parameters.controller_file)
-            check_delay(controller, parameters)
-            if self.servo and parameters.force_control:
-                raise ParameterError(
-                    "'controller_file': with 'force_control' no controller runs, which could change"
-                )
-            if self.servo and controller.sample_time != self.servo.sample_time:
-                raise ParameterError(
-                    f"'controller_file' is '{parameters.controller_file}', made for "
-                    f"{controller.sample_time:g} s, the loop runs at {self.servo.sample_time:g} s: deactivate "
-                    f"'{self.NAME}' first"
-                )
+        before = self.parameters
+        names = "controller_file", "preview_band"
+        if self.active and all(getattr(before, n) == getattr(parameters, n) for n in names):
+            return
+        controller = self._controller(parameters)
+        check_delay(controller, parameters)
+        if not self.servo:
+            return
+        if parameters.force_control:
+            raise ParameterError(
+                "'controller_file': with 'force_control' no controller runs, which could change"
+            )
+        if controller.sample_time != self.servo.sample_time:
+            raise ParameterError(
+                f"'controller_file' is '{parameters.controller_file}', made for "
+                f"{controller.sample_time:g} s, the loop runs at {self.servo.sample_time:g} s: deactivate "
+                f"'{self.NAME}' first"
+            )
+        self.servo.check_controller(controller)
 
-    def _controller(self, name: str) -> FeedbackParameters:
-        controller = successor(name, self.servo.feedback if self.servo else FeedbackParameters())
-        band = self.parameters.preview_band or controller.preview_band
+    def _controller(self, parameters: ServoNodeParameters) -> FeedbackParameters:
+        present = self.servo.feedback if self.servo else FeedbackParameters()
+        controller = successor(parameters.controller_file, present)
+        band = parameters.preview_band or controller.preview_band
         return replace(controller, preview_band=band)
+
+    def _object(self, controller: FeedbackParameters) -> None:
+        """Say what the certificate of a controller that is to run does not cover."""
+        self._objections = (
+            [] if self.parameters.force_control else objections(controller, self._feedforward)
+        )
+        for objection in self._objections:
+            self.get_logger().warning(
+                f"controller '{controller.name}' ({self.parameters.controller_file}): {objection}: nothing says "
+                "that the loop is stable with this finger"
+            )
 
     def start(self) -> None:
         p = self.parameters
-        controller = self._controller(p.controller_file)
+        controller = self._controller(p)
         check_delay(controller, p)
-        if controller.controller != "none" and not (controller.certified or p.force_control):
-            self.get_logger().warning(
-                f"controller '{controller.name}' ({p.controller_file}) is not certified: nothing says "
-                "that the loop is stable with this finger"
-            )
-        feedforward = read_feedforward(p)
+        feedforward = self._feedforward = read_feedforward(p)
+        self._object(controller)
+        feeling = None
+        if p.force_control:
+            feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
-        feeling = None
+        try:
+            self.servo = Servo(
+                driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling
+            )
+        except ParameterError:
+            driver.close()
+            raise
         if p.force_control:
-            feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
             self.thermometer = Thermometer(p.thermometer, time.monotonic())
             self._temperature_input = TemperatureInput(self, self._on_temperature)
             # A finger that has this topic is taken for one that feels.
             self.singles["push"] = self.create_publisher(Sample, "push", SAMPLE)
-        self.servo = Servo(driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling)
         self.reference.restart(controller.sample_time)
         self._refer()
         self._told = time.monotonic()
@@ -170,9 +191,10 @@ class ServoNode(FingerNode):
     def apply(self) -> None:
         """Let the controller of a changed `controller_file` take over."""
         if self.servo:
-            controller = self._controller(self.parameters.controller_file)
+            controller = self._controller(self.parameters)
             if controller != self.servo.feedback:
                 self.servo.change_controller(controller)
+                self._object(controller)
                 self.get_logger().info(f"controller '{controller.name}' takes over")
                 self._say_origins()
 
@@ -188,6 +210,7 @@ class ServoNode(FingerNode):
         figures: dict[str, Any] = {
             "controller": s.feedback.name,
             "certified": s.feedback.certified,
+            "not covered": "; ".join(self._objections),
             "sample": s.number,
             "rate (Hz)": f"{self._rate():.1f}",
             "missed periods": s.missed,

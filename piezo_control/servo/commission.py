@@ -21,7 +21,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: small matrices only
@@ -47,13 +47,14 @@ from piezo_control.identification.hysteresis import (  # noqa: E402
 )
 from piezo_control.identification.measurement import Measurement, MeasurementError  # noqa: E402
 from piezo_control.options import within  # noqa: E402
-from piezo_control.parameters import ParameterError, dump, flatten  # noqa: E402
+from piezo_control.parameters import ParameterError, build, dump, flatten  # noqa: E402
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
 from piezo_control.servo.driver import DriverError, open_driver  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
 from piezo_control.servo.parameters import ServoParameters  # noqa: E402
 from piezo_control.shared import shared_folder  # noqa: E402
+from piezo_control.start import interrupt_at_signals  # noqa: E402
 
 VOLT = 1e-6  # m of reference per V: the loop is open here, and its command stands for a voltage
 PLAYS = 16
@@ -90,11 +91,14 @@ class Bench:
         """
         a = self.arguments
         h = a.sample_time
-        parameters = ServoParameters(
-            write=a.write, sensor_scale=self.scale, sensor_zero=self.zero,
-            sensor_low=-LARGEST_DEFLECTION, sensor_high=LARGEST_DEFLECTION,
-            amplifier_gain=a.amplifier_gain, model_tolerance=LARGEST_DEFLECTION,
-            cycle_amplitude=LARGEST_DEFLECTION, missed_limit=10**6, late_share=1.0,
+        card = {
+            "write": a.write, "sensor_scale": self.scale, "sensor_zero": self.zero,
+            "amplifier_gain": a.amplifier_gain,
+        }  # fmt: skip
+        parameters = replace(
+            build(ServoParameters, card), sensor_low=-LARGEST_DEFLECTION, sensor_high=LARGEST_DEFLECTION,
+            model_tolerance=LARGEST_DEFLECTION, cycle_amplitude=LARGEST_DEFLECTION,
+            missed_limit=10**6, late_share=1.0,
         )  # fmt: skip
         straight = FeedforwardParameters(
             compensator="static_gain", static_gain=VOLT, **vars(self.limits)
@@ -107,9 +111,9 @@ class Bench:
             open_driver(a.driver, a.driver_options, h), parameters, whole, straight, a.priority
         )
         servo.refer(Profile(voltage.time + SETTLING, VOLT * voltage.value, voltage.linear))
-        servo.start()
         taken = []
         try:
+            servo.start()
             while servo.number * h < duration + 2.0 * SETTLING:
                 if servo.phase in (RAMPING, FAULT):
                     raise NoAnswer(servo.cause)
@@ -323,11 +327,14 @@ def main() -> int:
     """Run the command line and return its exit code."""
     a = parse()
     console = Console()
+    interrupt_at_signals()
     try:
         if (a.out / "servo.yaml").exists() and not a.overwrite:
             raise ParameterError(f"{a.out} has a servo.yaml; name a new --out or give --overwrite")
         read_problem(a.problem or PROBLEM)  # before anything moves
-        limits = VoltageParameters(a.voltage_low, a.voltage_high, a.slew_limit, a.rest_voltage)
+        limits = build(
+            VoltageParameters, {f.name: getattr(a, f.name) for f in fields(VoltageParameters)}
+        )
         found = commission(
             Bench(a, limits, a.sensor_scale),
             console,
@@ -338,6 +345,9 @@ def main() -> int:
         return 2
     except (NoAnswer, MeasurementError, SynthesisError) as error:
         print(f"commission: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("commission: ended by a signal; the voltage is led to rest", file=sys.stderr)
         return 1
     if found is None:
         console.print("stopped; the finger is at rest, nothing was written")
@@ -367,7 +377,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--driver", default="simulated", help="as the servo's (%(default)s)")
     parser.add_argument("--driver-options", default="", metavar="TEXT")
     parser.add_argument(
-        "--sample-time", type=float, default=1e-4, metavar="S", help="(%(default)s)"
+        "--sample-time",
+        type=within(float, 1e-6, 0.1),
+        default=1e-4,
+        metavar="S",
+        help="(%(default)s)",
     )
     parser.add_argument("--write", choices=("immediately", "next_edge"), default="immediately")
     parser.add_argument(
@@ -392,7 +406,10 @@ def parse() -> argparse.Namespace:
         help="V at the finger per unit that the card puts out (%(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--share", type=float, default=0.1, help="of the voltage for the first steps (%(default)s)"
+        "--share",
+        type=within(float, 1e-3, 1.0),
+        default=0.1,
+        help="of the voltage for the first steps (%(default)s)",
     )
     parser.add_argument(
         "--problem", type=Path,

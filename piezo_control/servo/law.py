@@ -29,6 +29,7 @@ from piezo_control.feedback import (
     feedback_coefficients,
     feedback_step,
     hand_over,
+    uncovered,
 )
 from piezo_control.feedforward import (
     Feedforward,
@@ -292,6 +293,12 @@ def laws_of(
         as_arrays(feedforward.state),
         feeling,
     )
+
+
+def objections(feedback: FeedbackParameters, feedforward: FeedforwardParameters) -> list[str]:
+    """Return what speaks against running the controller on this finger, in words; empty: nothing."""
+    reach = Feedforward(feedforward, feedback.sample_time).reachable_range
+    return uncovered(feedback, feedback.delay_samples, feedback.denominator, reach)
 
 
 def watch_at_rest() -> Watch:

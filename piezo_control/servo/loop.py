@@ -39,6 +39,7 @@ from piezo_control.servo.law import (
     Laws,
     Settings,
     Watch,
+    empty_controller,
     judge_time,
     laws_of,
     put_controller,
@@ -120,7 +121,9 @@ def run(loop: Loop, device: Any) -> None:
         late = wait_for_edge(clock)
         if loop.orders.reset[0] != resets:
             resets = loop.orders.reset[0]
-            rearm(loop.watch)
+            # Of a finger that runs there is nothing to leave, and one that feels would take the push of now for none.
+            if loop.watch.phase[0] >= RAMPING:
+                rearm(loop.watch)
         if loop.orders.stop[0] != 0 and loop.watch.phase[0] < RAMPING:
             trip(loop.watch, STOPPED, 0.0)
         if loop.orders.fault[0] != NO_CAUSE and loop.watch.phase[0] < RAMPING:
@@ -284,11 +287,11 @@ class Servo:
         return self._thread.is_alive()
 
     def stop(self) -> None:
-        """Bring the voltage to rest, end the loop and close the device."""
-        atexit.unregister(self.stop)
+        """Bring the voltage to rest, end the loop and close the device; interrupted, the program's end goes on with it."""
         self._loop.orders.stop[0] = 1
         if self._thread.ident is not None:
             self._thread.join()
+        atexit.unregister(self.stop)
         self.driver.close()
 
     def feel(self, temperature_degc: float) -> None:
@@ -300,24 +303,42 @@ class Servo:
         self._loop.orders.fault[0] = TEMPERATURE
 
     def reset(self) -> None:
-        """Leave a latched fault; the controller takes over from rest."""
+        """Leave a latched fault; the controller takes over from where the voltage is.
+
+        Raises ParameterError for a finger that feels and is not at rest yet: it may still push.
+        """
+        if self._loop.settings.feels and self.phase == RAMPING:
+            raise ParameterError(
+                "the voltage is on its way to rest, and the tip may push: reset it there"
+            )
         self._loop.orders.fault[0] = NO_CAUSE
         self._loop.orders.reset[0] += 1
+
+    def _room_for(self, feedback: FeedbackParameters) -> int:
+        """Return which of the two controllers can be replaced; ParameterError: none, or not by this one."""
+        if feedback.sample_time != self.sample_time:
+            raise ParameterError(
+                f"controller '{feedback.name}' was made for {feedback.sample_time:g} s, the loop runs at "
+                f"{self.sample_time:g} s"
+            )
+        watch = self._loop.watch
+        other = 1 - int(self._loop.orders.controller[0])
+        # No controller is in use by a finger at rest, or on its way there: the one that is asked for takes over then.
+        if self.is_running and watch.phase[0] < RAMPING and watch.in_use[0] == other:
+            raise ParameterError("the last change of the controller is not through yet: try again")
+        return other
+
+    def check_controller(self, feedback: FeedbackParameters) -> None:
+        """Raise ParameterError if :meth:`change_controller` would."""
+        self._room_for(feedback)
+        put_controller(empty_controller(), feedback)
 
     def change_controller(self, feedback: FeedbackParameters) -> None:
         """Let another controller take over between two samples, with the command where it is.
 
         Raises ParameterError when it was made for another sample time, or cannot be taken.
         """
-        if feedback.sample_time != self.sample_time:
-            raise ParameterError(
-                f"controller '{feedback.name}' was made for {feedback.sample_time:g} s, the loop runs at "
-                f"{self.sample_time:g} s"
-            )
-        orders, watch = self._loop.orders, self._loop.watch
-        other = 1 - int(orders.controller[0])
-        if self.is_running and watch.in_use[0] == other:
-            raise ParameterError("the last change of the controller is not through yet: try again")
+        other, orders = self._room_for(feedback), self._loop.orders
         put_controller(self._loop.laws.controllers[other], feedback)
         self.feedback = feedback
         orders.controller[0] = other

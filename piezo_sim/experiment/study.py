@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import shutil
 import sys
@@ -65,14 +66,17 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
 def results_folder(out: Path, overwrite: bool) -> Iterator[Path]:
     """Yield a folder beside `out` for results, which take their place in `out` when all went well.
 
-    What is in `out` under other names stays. After a failure the folder is left as it is, for its logs.
-    Raises FileExistsError if `out` is a file, or holds something and may not be replaced.
+    What is in `out` under other names stays. After a failure the folder is left as it is, for its logs and for the
+    bags of a run that was cut, which no later run deletes. Raises FileExistsError if `out` is a file, or holds
+    something and may not be replaced.
     """
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"--out is {out}, which is a file; name a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:
         raise FileExistsError(f"{out} is not empty; name a new --out or give --overwrite")
-    folder = out.with_name(f"{out.name}.unfinished")
+    ends = itertools.chain([""], map("-{}".format, itertools.count(2)))
+    folders = (out.with_name(f"{out.name}.unfinished{end}") for end in ends)
+    folder = next(folder for folder in folders if not (folder / "bags").exists())
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     yield folder

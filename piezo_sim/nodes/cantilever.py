@@ -26,7 +26,7 @@ from rosgraph_msgs.msg import Clock
 
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import wrong_time
+from piezo_control.nodes.block import too_old, wrong_time
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
@@ -232,6 +232,14 @@ class CantileverNode(FingerNode):
             else:
                 self._take(voltage)
                 self._advance()
+        elif (
+            not self.number - 2 <= voltage.number <= self.number
+        ):  # answers may come twice, and a way to rest
+            self.get_logger().error(
+                f"'voltage' brought sample {voltage.number}, expected {self.number}: does another node answer this "
+                "topic?",
+                throttle_duration_sec=1.0,
+            )
 
     def _take(self, voltage: Sample) -> None:
         self.limited += voltage.limited
@@ -314,6 +322,8 @@ class CantileverNode(FingerNode):
                 f"'voltage' is {voltage.value} V, must be finite and within ±{LARGEST_VOLTAGE:g} V; ignored",
                 throttle_duration_sec=1.0,
             )
+        elif old := too_old(voltage, "voltage", self.parameters.age_limit):
+            self.get_logger().error(old, throttle_duration_sec=1.0)
         else:
             self._take(voltage)
             self.guard.hear(now)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from piezo_control.nodes.parameters import LoopParameters
+from piezo_control.nodes.parameters import BlockParameters, LoopParameters
 from piezo_control.parameters import parameter
 from piezo_control.safety import HIGHEST_DEGC, LOWEST_DEGC, SafetyParameters
 from piezo_sim.plant.cantilever import CantileverParameters
@@ -13,7 +13,7 @@ from piezo_sim.temperature import TemperatureParameters
 
 
 @dataclass(frozen=True)
-class CantileverNodeParameters(CantileverParameters, LoopParameters, SafetyParameters):
+class CantileverNodeParameters(CantileverParameters, BlockParameters, SafetyParameters):
     """The plant's parameters and the node's own."""
 
     samples: int = parameter(0, "samples to take, then finish; 0: without end", low=0, high=10**12)
