@@ -1,47 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
 """The loop in real time on a driver, and a recorder if wanted, in one namespace.
 
-Record it with `ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`
+    ros2 launch piezo_gripper servo.launch.py params:=commissioned/servo.yaml
+
+What is named here goes before what the parameter file says. Record it with
+`ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`
 and the topics; without the file rosbag2 loses samples (docs/recordings.md).
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-ARGUMENTS = {
-    "namespace": ("finger", "namespace of the finger's nodes and topics"),
-    "driver": ("simulated", "'simulated', 'udp', 'iio', or the path of a shared library"),
-    "driver_options": ("", "of the driver"),
-    "controller_file": ("robust", "controller: a shipped name, or the path of a parameter file"),
-    "feedforward_file": ("", "parameter file of inverse and limits; empty: the paper's finger"),
-    "voltage_share": ("1.0", "share of the voltage limits that is used"),
-    "record": ("false", "record every sample into a bag in the present folder"),
+from piezo_control.nodes import launched
+
+# Of the servo; empty: as the parameter file says, or else the node's default.
+OF_THE_SERVO = {
+    "driver": (str, "'simulated', 'udp', 'iio', or the path of a shared library"),
+    "driver_options": (str, "of the driver"),
+    "controller_file": (
+        str,
+        "controller: a shipped name ('robust'), or the path of a parameter file",
+    ),
+    "feedforward_file": (
+        str,
+        "parameter file of inverse and limits; the paper's finger where none is named",
+    ),
+    "voltage_share": (float, "share of the voltage limits that is used"),
+    "force_control": (bool, "feel and limit the force, in place of the controller (docs/touch.md)"),
 }
-TEXTS = ("driver", "driver_options", "controller_file", "feedforward_file")
+ARGUMENTS = (
+    launched.ARGUMENTS
+    | {"params": ("", "parameter file, such as the servo.yaml that `commission` writes")}
+    | {name: ("", text) for name, (_, text) in OF_THE_SERVO.items()}
+)
+CHOICES = {
+    name: launched.SWITCH for name, (default, _) in ARGUMENTS.items() if default in launched.SWITCH
+}
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes that the arguments ask for."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    asked = {
+        name: ParameterValue(given[name], value_type=kind)
+        for name, (kind, _) in OF_THE_SERVO.items()
+        if given[name]
+    }
+    return launched.launched(context, given, {"servo": asked}, file_wins=False)
 
 
 def generate_launch_description() -> LaunchDescription:
-    namespace = LaunchConfiguration("namespace")
-    parameters = {name: ParameterValue(LaunchConfiguration(name), value_type=str) for name in TEXTS}
-    parameters["voltage_share"] = ParameterValue(
-        LaunchConfiguration("voltage_share"), value_type=float
-    )
-    common = {"package": "piezo_gripper", "namespace": namespace, "output": "screen"}
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value=value, description=text)
+                DeclareLaunchArgument(
+                    name, default_value=value, description=text, choices=CHOICES.get(name)
+                )
                 for name, (value, text) in ARGUMENTS.items()
             ),
-            Node(executable="servo", parameters=[parameters], **common),
-            Node(
-                executable="recorder",
-                condition=IfCondition(LaunchConfiguration("record")),
-                **common,
-            ),
+            OpaqueFunction(function=nodes),
         ]
     )

@@ -331,6 +331,7 @@ def test_a_changed_parameter_is_used_before_the_first_sample(neighbour, tmp_path
     assert commands[0].value == 5e-6
 
 
+@pytest.mark.shows("a reset of what is not at fault")
 def test_a_reset_of_a_feedback_that_runs_changes_nothing(neighbour, tmp_path):
     with node("feedback", tmp_path, "feedback_robust.yaml"):
         commands = neighbour.listen(Sample, "command")
@@ -347,6 +348,7 @@ def test_a_reset_of_a_feedback_that_runs_changes_nothing(neighbour, tmp_path):
     assert steps[18:22].max() <= 2.0 * steps[10:18].max()
 
 
+@pytest.mark.shows("a count of samples that begins anew")
 def test_a_loop_that_runs_free_follows_a_count_that_begins_anew(neighbour, tmp_path):
     """As of a driver that was started again: numbers from 1 on after thousands."""
     with node("feedback", tmp_path, mode="free_running"):
@@ -483,6 +485,23 @@ def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing
     commands._on_trajectory(JointTrajectory(joint_names=["gripper_joint"]))
     node._watch()
     assert node.motion is None
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.mark.shows("a gripper whose `sample_time` is not its fingers'")
+def test_a_gripper_with_another_sample_time_than_its_fingers_says_so_and_does_not_move():
+    """Its ways are planned in the fingers' time: with another one they would be steps."""
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    for finger in node.fingers:
+        finger._take(FingerState(phase=FingerState.RUNNING, period=1e-4))
+    assert "takes a sample" not in node.fingers[0].problem()
+    node.fingers[1]._take(FingerState(phase=FingerState.RUNNING, period=1e-3))
+    expected = "finger 'right' takes a sample every 0.001 s, 'sample_time' of 'gripper' is 0.0001 s"
+    assert node.fingers[1].problem() == expected
     node.destroy_node()
     rclpy.shutdown()
 

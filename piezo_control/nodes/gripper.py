@@ -187,7 +187,16 @@ class Finger:
             return f"finger '{self.name}' (nothing on '{topic}')"
         if self.state.phase != FingerState.RUNNING:
             return f"finger '{self.name}' (it is {PHASES[self.state.phase]})"
-        return f"finger '{self.name}' (it tells no force)"
+        return f"finger '{self.name}' (it {self._pace() or 'tells no force'})"
+
+    def _pace(self) -> str:
+        """Return in words that the finger's time is not the gripper's, in which its ways are planned; empty: it is."""
+        period, own = self.state.period, self._node.parameters.sample_time
+        if not period or abs(period - own) <= 1e-6 * own:
+            return ""
+        return (
+            f"takes a sample every {period:g} s, 'sample_time' of '{self._node.NAME}' is {own:g} s"
+        )
 
     def problem(self) -> str:
         """Return why the finger cannot move, or nothing."""
@@ -197,6 +206,8 @@ class Finger:
             text = f" ({self.state.text})" if self.state.text else ""
             phase = PHASES[self.state.phase].upper()
             return f"finger '{self.name}' is {phase}{text}, must be RUNNING"
+        if pace := self._pace():
+            return f"finger '{self.name}' {pace}"
         if self.numbness():
             return ""
         topic = self._node.resolve_topic_name(f"{self.name}/push")

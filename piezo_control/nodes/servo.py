@@ -339,6 +339,7 @@ class ServoNode(FingerNode):
             self._rates.append((time.monotonic(), s.number + 1 - s.missed))
             self._rates = self._rates[-11:]
             state.samples = max(0, s.number + 1)
+            state.period = s.sample_time
             state.voltage = s.voltage
             state.clipped = s.clipped
             state.overruns = s.missed

@@ -411,6 +411,7 @@ class CantileverNode(FingerNode):
 
     def _publish_state(self) -> None:
         state = FingerState(phase=self.phase, samples=self.number, text=self.text)
+        state.period = self.parameters.sample_time
         if self.without_temperature and not self.text:
             state.text = "'voltage' is by models whose temperature is missing or frozen"
         state.since = base.wall_time(self.guard.since)
