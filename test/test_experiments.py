@@ -508,3 +508,18 @@ def test_a_study_that_is_stopped_says_so_and_replaces_nothing(tmp_path, capsys):
     assert study.run(arguments, "A study", work) == 1
     assert f"grasp: stopped; what was there before in {out} is unchanged" in capsys.readouterr().err
     assert (out / "report.html").read_text() == "of before"
+
+
+def test_the_bags_of_a_run_that_was_cut_are_deleted_by_no_later_one(tmp_path):
+    out = tmp_path / "step"
+    with pytest.raises(KeyboardInterrupt), study.results_folder(out, False) as folder:
+        (folder / "bags").mkdir()
+        (folder / "bags" / "cut.mcap").write_text("a day's work")
+        raise KeyboardInterrupt
+    for _ in range(2):  # an analysis that fails, then one that does not
+        with pytest.raises(OSError, match="disk"), study.results_folder(out, False) as other:
+            raise OSError("disk")
+    with study.results_folder(out, False) as other:
+        (other / "report.html").write_text("done")
+    assert (folder / "bags" / "cut.mcap").read_text() == "a day's work"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["step", "step.unfinished"]

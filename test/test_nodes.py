@@ -211,6 +211,7 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
     with node("feedback", tmp_path, force_control=True):
         answers = neighbour.listen(Sample, "command")
         pushes = neighbour.listen(Sample, "push")
+        followed = neighbour.listen(Profile, "reference_followed_profile", FOLLOWED)
         profile = neighbour.node.create_publisher(Profile, "reference_profile", LATCHED)
         profile.publish(Profile(time=[0.0], value=[10e-6], max_force=limit))
         neighbour.wait(lambda: profile.get_subscription_count() > 0)
@@ -233,6 +234,8 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
                 expected.publish(sample(number, unhindered))
             neighbour.wait(lambda n=number: answers[-1].number == n)
         neighbour.wait(lambda: pushes)
+        neighbour.wait(lambda: followed)
+        assert followed[-1].max_force == limit  # the bag says how hard it was to push
     first = [a.number for a in answers].count(0)
     assert [a.value for a in answers[first - 1 :]] == commands
     assert all(a.by_controller for a in answers)

@@ -195,6 +195,9 @@ def test_a_gripper_of_two_servos_grasps_and_lets_go(tmp_path):
         assert grasped.opening == pytest.approx(opening, abs=0.15e-6)
         finger = ros.finger("left")
         finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+        setup = finger.setup()
+        assert setup.controller == "force control"
+        assert setup.force_limit == DEFAULTS.force_limit
         # Nobody publishes a temperature here, and that is said where people look.
         finger.wait_for(lambda: finger.state.text == "temperature missing: none for 5 s")
         assert math.isnan(finger.state.temperature)
