@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from piezo_control.identification.measurement import (
     MeasurementError,
     read_measurement,
 )
+from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
 
 SAMPLE_TIME = 1e-4
@@ -29,9 +31,12 @@ NONE = ModesParameters()
 DAMPING = 8.1e-6 / (2.0 * math.sqrt(5.7e-8))
 
 
-def measured(voltage, tip_force, modes=NONE):
+def measured(voltage, tip_force, modes=NONE, bandwidth_hz=0.0):
     """The default finger: 10 nm steps, 5 nm noise, one sample of delay, creep."""
-    plant = Cantilever(CantileverParameters(sample_time=SAMPLE_TIME, modes=modes))
+    amplifier = AmplifierParameters(bandwidth_hz=bandwidth_hz)
+    plant = Cantilever(
+        CantileverParameters(sample_time=SAMPLE_TIME, modes=modes, amplifier=amplifier)
+    )
     deflection = []
     for v, force in zip(voltage.tolist(), tip_force.tolist()):
         deflection.append(plant.measure())
@@ -166,6 +171,30 @@ def test_as_many_modes_are_found_as_there_are(modes):
         assert found.damping_ratio == pytest.approx(damping, rel=0.02)
         assert found.share == pytest.approx(share, rel=0.01)
     left = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
+    assert np.sqrt(np.mean(left**2)) < 8e-9  # noise of 5 nm, steps of 10 nm: 5.8 nm
+
+
+@pytest.mark.parametrize("late", [0, 2])
+@pytest.mark.parametrize("modes", [NONE, ModesParameters((4178.0,), (0.017,), (0.08,))])
+@pytest.mark.parametrize("bandwidth_hz", [0.0, 200.0, 1000.0, 4000.0])
+def test_the_lag_of_an_amplifier_is_told_from_hysteresis_damping_and_delay(
+    bandwidth_hz, modes, late
+):
+    measurement = measured(step(40.0, 800), np.zeros(800), modes, bandwidth_hz)
+    shifted = np.concatenate((np.zeros(late), measurement.deflection))[:800]
+    static = partial(deflection_history, HysteresisParameters())
+    model = identify_dynamics(
+        replace(measurement, deflection=shifted), measurement.voltage, 3, static
+    )
+    assert model.bandwidth_hz == pytest.approx(bandwidth_hz, rel=2e-3)
+    assert model.delay_samples == late
+    assert len(model.modes) == len(modes.share)
+    assert model.natural_frequency == pytest.approx(FREQUENCY, rel=1e-4)
+    assert model.damping_ratio == pytest.approx(DAMPING, rel=0.01)
+    if bandwidth_hz:
+        half_width = model.confidence["amplifier.bandwidth_hz"]
+        assert 0.0 < half_width < 2e-3 * bandwidth_hz
+    left = shifted - model.deflection(measurement.time, measurement.voltage, static)
     assert np.sqrt(np.mean(left**2)) < 8e-9  # noise of 5 nm, steps of 10 nm: 5.8 nm
 
 

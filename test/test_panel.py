@@ -253,7 +253,7 @@ class Page:
     def trace(self, finger):
         """Return what is drawn of a finger's signals, in their units, and the times in s."""
         columns = self.ask(
-            f"""() => Object.entries(Bokeh.documents[0].get_model_by_name("source{finger}").data)
+            f"""() => Object.entries(Bokeh.documents[0].get_model_by_name("source{finger}")?.data ?? {{}})
                 .map(([name, values]) => [name, Array.from(values)])"""
         )
         drawn = {name: np.array(values, dtype=float) for name, values in columns}
@@ -337,7 +337,7 @@ def test_set_point_moves_the_finger_and_its_trace(page, left):
     page.shows("/left: set-point 6.5 µm: done", ".messages")
     page.ask(
         """() => Math.abs(
-            Bokeh.documents[0].get_model_by_name("source/left").data.deflection.at(-1) - 6.5) < 0.1"""
+            Bokeh.documents[0].get_model_by_name("source/left")?.data.deflection.at(-1) - 6.5) < 0.1"""
     )
     page.press("zero")
     left.wait_for(near(left, 0.0))
@@ -465,7 +465,7 @@ def test_without_control_there_is_nothing_to_drive_with(onlooker, browser, left)
     assert {"set_point", "stop", "go", "wave"} & set(names) == set()
     later = page.trace("/left")["clock"][-1] + 1.0
     page.ask(
-        f"""() => Bokeh.documents[0].get_model_by_name("source/left").data.clock.at(-1) > {1e3 * later}"""
+        f"""() => Bokeh.documents[0].get_model_by_name("source/left")?.data.clock.at(-1) > {1e3 * later}"""
     )
     assert page.errors == []
 

@@ -16,6 +16,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,12 @@ from piezo_control.identification import checks, plots
 from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
 from piezo_control.identification.confidence import Values, lines
 from piezo_control.identification.drift import SMALLEST_WARMING, identify_drift, is_loop
-from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics, need_vibration
+from piezo_control.identification.dynamics import (
+    DynamicsModel,
+    Static,
+    identify_dynamics,
+    need_vibration,
+)
 from piezo_control.identification.fit import FitQuality, need, quality, straight
 from piezo_control.identification.hysteresis import (
     HysteresisModel,
@@ -189,10 +195,21 @@ def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
     measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("voltage")
     stored = arguments.out / "feedforward.yaml"
-    drive = measurement.voltage
-    if stored.exists():
-        drive = deflection_history(stored_hysteresis(stored), drive)
-    return finish_dynamics("dynamics", measurement, drive, [drive], arguments, console)
+    if not stored.exists():
+        return finish_dynamics(
+            "dynamics",
+            measurement,
+            measurement.voltage,
+            [measurement.voltage],
+            None,
+            arguments,
+            console,
+        )
+    static = partial(deflection_history, stored_hysteresis(stored))
+    less = [static(measurement.voltage)]
+    return finish_dynamics(
+        "dynamics", measurement, measurement.voltage, less, static, arguments, console
+    )
 
 
 def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
@@ -202,7 +219,9 @@ def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
     if np.ptp(measurement.voltage) > 0.0:
         k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
         raise measurement.error("voltage", k, "must be constant while the tip force changes")
-    return finish_dynamics("stiffness", measurement, measurement.tip_force, [], arguments, console)
+    return finish_dynamics(
+        "stiffness", measurement, measurement.tip_force, [], None, arguments, console
+    )
 
 
 def finish_dynamics(
@@ -210,18 +229,19 @@ def finish_dynamics(
     measurement: Measurement,
     drive: np.ndarray,
     less: Sequence[np.ndarray],
+    static: Static | None,
     arguments: argparse.Namespace,
     console: Console,
 ) -> list[Path]:
-    """Fit, show and store the response to `drive`, which has to explain more than `less` of it does."""
+    """Fit, show and store the response to `drive`, through `static`, which has to explain more than `less` does."""
     checks.clipped(measurement)
-    model = identify_dynamics(measurement, drive, arguments.modes if less else 1)
+    model = identify_dynamics(measurement, drive, arguments.modes if less else 1, static)
     if model.gain < 0.0:
         what = "voltage" if less else "tip_force"
         raise checks.reversed_sensor(measurement, f"gain {model.gain:.3g}", what)
     if less:
-        need_vibration(measurement, drive, model)
-    modelled = model.deflection(measurement.time, drive)
+        need_vibration(measurement, drive, model, static)
+    modelled = model.deflection(measurement.time, drive, static)
     fit = quality(
         measurement.deflection,
         modelled,
@@ -252,6 +272,9 @@ def finish_dynamics(
             "sensor": {"delay_samples": found["delay_samples"]},
         }
         found.update({f"modes.{key}": value for key, value in modes.items() if value})
+        if model.bandwidth_hz:
+            groups["amplifier"] = {"bandwidth_hz": model.bandwidth_hz}
+            found["amplifier.bandwidth_hz"] = model.bandwidth_hz
     else:
         groups = {"dynamics": {"elastic_constant": found.pop("gain")}}
         confidence["elastic_constant"] = confidence.pop("gain")

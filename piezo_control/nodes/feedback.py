@@ -106,7 +106,7 @@ class FeedbackNode(BlockNode):
             raise ParameterError(
                 "'name': a controller changes as a whole, by 'controller_file' or in one atomic request"
             )
-        if changed and not self._loading and parameters.certified:
+        if self.active and changed and not self._loading and parameters.certified:
             raise ParameterError(
                 "'certified' is true: single parameters bring no certificate; take the controller by "
                 "'controller_file', or set 'certified' to false with them"

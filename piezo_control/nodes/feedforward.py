@@ -30,7 +30,7 @@ from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
-from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, SAMPLE
 from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
     FAULT,
@@ -260,6 +260,8 @@ class FeedforwardNode(BlockNode):
         while self.guard.phase == RAMPING:
             self._ramp()
             time.sleep(RAMP_PERIOD)
+        # The program may end right after this; what was sent last is what the finger is left at.
+        self.answers.wait_for_all_acked(DELIVERY_TIMEOUT)
         self.guard.reset()
 
     def _watch(self) -> None:

@@ -29,7 +29,6 @@ from time import monotonic
 from typing import Any
 
 from rclpy.client import Client
-from rclpy.duration import Duration
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -56,14 +55,13 @@ from piezo_control.nodes.faces.joint_states import JointStates
 from piezo_control.nodes.faces.services import Services
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import to_message
-from piezo_control.nodes.qos import LATCHED, NEWEST
+from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, NEWEST
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
 from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 WATCH_PERIOD = 0.1  # s
-DELIVERY_TIMEOUT = Duration(seconds=0.5)
 VELOCITY_WINDOW = 0.1  # s of the finger's time: the sensor's quantum of 10 nm is 0.1 µm/s then
 PUSH_TIMEOUT = 0.5  # s of the finger's time; pushes come every 10 ms of it
 LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second

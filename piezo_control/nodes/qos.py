@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Quality of service by role (REP-2003)."""
 
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 # Numbered samples: reliable, and deep enough that a recorder may fall behind by seconds.
@@ -35,3 +36,6 @@ LATCHED = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
+
+DELIVERY_TIMEOUT = Duration(seconds=0.5)
+"""So long the end of a node waits for the readers of what it said last."""

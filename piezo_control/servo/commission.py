@@ -21,7 +21,9 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy: small matrices only
@@ -51,6 +53,7 @@ from piezo_control.parameters import ParameterError, build, dump, flatten  # noq
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
 from piezo_control.servo.driver import DriverError, open_driver  # noqa: E402
+from piezo_control.servo.law import SENSOR_OLD  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
 from piezo_control.servo.parameters import ServoParameters  # noqa: E402
 from piezo_control.shared import shared_folder  # noqa: E402
@@ -75,6 +78,10 @@ class NoAnswer(RuntimeError):
     """A finger that does not do what one can go on with; the message says what it did."""
 
 
+class LateReadings(NoAnswer):
+    """Readings that were too old."""
+
+
 @dataclass
 class Bench:
     """What moves the finger, and what is known of its sensor so far."""
@@ -87,8 +94,15 @@ class Bench:
     def move(self, voltage: Profile, duration: float) -> Samples:
         """Apply a voltage (V over s) for `duration` s and return every sample; starts and ends at rest.
 
-        Raises NoAnswer when the servo ends it, DriverError when the device does not open.
+        Again where readings came late, as on a machine that is busy for a moment. Raises NoAnswer when the servo ends
+        it otherwise, DriverError when the device does not open.
         """
+        for _ in range(ATTEMPTS - 1):
+            with suppress(LateReadings):
+                return self._move(voltage, duration)
+        return self._move(voltage, duration)
+
+    def _move(self, voltage: Profile, duration: float) -> Samples:
         a = self.arguments
         h = a.sample_time
         card = {
@@ -116,7 +130,9 @@ class Bench:
             servo.start()
             while servo.number * h < duration + 2.0 * SETTLING:
                 if servo.phase in (RAMPING, FAULT):
-                    raise NoAnswer(servo.cause)
+                    raise (LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer)(
+                        servo.cause
+                    )
                 time.sleep(0.02)
                 servo.look_ahead()
                 taken.append(servo.samples())
@@ -264,24 +280,33 @@ def commission(
     fit = quality(slow.deflection[fitted], shown[fitted], line[fitted])
     console.print(f"hysteresis: rms {fit.rms_percent:.2f} % of {fit.stroke * 1e6:.3g} µm")
     need("the hysteresis", {"decaying sine": fit}, "a straight line")
+    # Once more, behind the hysteresis, whose width is no damping any more; now an amplifier's lag can be told from it.
+    operator = partial(deflection_history, hysteresis.parameters)
+    model = identify_dynamics(swept, swept.voltage, static=operator)
+    lag = f"{model.bandwidth_hz:.4g} Hz" if model.bandwidth_hz else "faster than is seen"
+    console.print(
+        f"behind the hysteresis: damping ratio {model.damping_ratio:.4f}, delay {model.delay_samples} samples, "
+        f"amplifier {lag}"
+    )
     # What was called zero is the finger at rest; the model's zero is a homed finger at 0 V.
-    bench.zero -= float(deflection_history(hysteresis.parameters, [home])[0]) / bench.scale
+    bench.zero -= float(operator([home])[0]) / bench.scale
     folder: Path = a.out
     folder.mkdir(parents=True, exist_ok=True)
     origin = f"Commissioned on driver '{a.driver}' ({a.driver_options or 'no options'})."
     limits = vars(bench.limits)
-    operator = {f"hysteresis.{n}": v for n, v in flatten(hysteresis.parameters).items()}
-    dump(folder / "feedforward.yaml", "feedforward", {**limits, **operator}, origin)
+    plays = {f"hysteresis.{n}": v for n, v in flatten(hysteresis.parameters).items()}
+    dump(folder / "feedforward.yaml", "feedforward", {**limits, **plays}, origin)
     finger = {
-        **operator,
+        **plays,
         "sample_time": a.sample_time,
         "dynamics.denominator": model.denominator,
         "sensor.delay_samples": model.delay_samples,
         "sensor.noise": rest.noise,
+        "amplifier.bandwidth_hz": model.bandwidth_hz,
         **{f"amplifier.{name}": value for name, value in limits.items()},
     }
     dump(folder / "cantilever.yaml", "cantilever", finger, origin)
-    reached = deflection_history(hysteresis.parameters, slow.voltage)
+    reached = operator(slow.voltage)
     stroke, noise = float(np.ptp(reached)), LARGEST_NOISE * rest.noise
     problem = read_problem(a.problem or PROBLEM, folder / "cantilever.yaml")
     if a.problem is None:

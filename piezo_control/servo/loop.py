@@ -398,13 +398,17 @@ class Servo:
         return int(self._loop.watch.phase[0])
 
     @property
+    def cause_code(self) -> int:
+        """What latched the fault: NO_CAUSE or another one of `CAUSES`."""
+        return int(self._loop.watch.cause[0])
+
+    @property
     def cause(self) -> str:
         """What latched the fault, in words; empty if nothing did."""
-        watch = self._loop.watch
-        code = int(watch.cause[0])
+        code = self.cause_code
         if code == NO_CAUSE:
             return ""
-        text = CAUSES[code](float(watch.cause_value[0]), self.parameters)
+        text = CAUSES[code](float(self._loop.watch.cause_value[0]), self.parameters)
         said = self.driver.error() if code in (DEVICE, SENSOR_SILENT) else ""
         return f"{text}: {said}" if said else text
 
