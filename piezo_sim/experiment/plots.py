@@ -22,6 +22,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from piezo_control.metrics import last_cycle  # noqa: E402
 from piezo_control.recording.recording import Recording  # noqa: E402
+from piezo_sim.experiment import zoom  # noqa: E402
 from piezo_sim.experiment.analysis import frequency_response  # noqa: E402
 
 Lines = Mapping[str, Sequence[Recording]]
@@ -41,7 +42,7 @@ def transient(panels: Panels, path: Path) -> Path:
     for axis, line, recording in _lines(axes, panels):
         axis.plot(recording.time * MS, recording.deflection * UM, lw=1, **line)
     _finish(axes, "t [ms]", "deflection [µm]")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def creep(panels: Panels, path: Path) -> Path:
@@ -51,7 +52,7 @@ def creep(panels: Panels, path: Path) -> Path:
         axis.plot(recording.time, recording.deflection * UM, lw=1, **line)
         axis.set_ylim(-5, 35)
     _finish(axes, "t [s]", "deflection [µm]")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def hysteresis(panels: Panels, path: Path) -> Path:
@@ -61,7 +62,7 @@ def hysteresis(panels: Panels, path: Path) -> Path:
         cycle = last_cycle(recording.voltage)
         axis.plot(recording.voltage[cycle], recording.deflection[cycle] * UM, lw=1, **line)
     _finish(axes, "U [V]", "deflection [µm]", "upper left")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def excite(panels: Panels, path: Path) -> Path:
@@ -70,7 +71,7 @@ def excite(panels: Panels, path: Path) -> Path:
     for axis, line, recording in _lines(axes, panels):
         axis.plot(recording.voltage, recording.deflection * UM, lw=0.7, **line)
     _finish(axes, "U [V]", "deflection [µm]", "upper left")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def feedforward(panels: Panels, path: Path) -> Path:
@@ -83,7 +84,7 @@ def feedforward(panels: Panels, path: Path) -> Path:
     for axis in axes:
         axis.axline((0, 0), slope=1, color="k", ls=":", lw=0.9, label="slope 1")
     _finish(axes, "reference [µm]", "deflection [µm]", "upper left")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def step(panels: Panels, path: Path, until: float | None = None) -> Path:
@@ -96,7 +97,7 @@ def step(panels: Panels, path: Path, until: float | None = None) -> Path:
         axis.plot(recording.time * MS, recording.reference * UM, "k--", lw=0.8, label="reference")
         axis.set_xlim(0, (until or recording.time[-1]) * MS)
     _finish(axes, "t [ms]", "deflection [µm]", "lower right")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def frequency(panels: Panels, path: Path) -> Path:
@@ -109,7 +110,7 @@ def frequency(panels: Panels, path: Path) -> Path:
         axis.axhline(-3, color="k", ls=":", lw=0.9, label="−3 dB")
         axis.set(xlim=(0.1, 1e4), ylim=(-18, 3))
     _finish(axes, "frequency [rad/s]", "magnitude [dB]", "lower left")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def thermal(panels: Panels, path: Path) -> Path:
@@ -129,7 +130,7 @@ def errors(panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], pa
         for colour, (label, (time, error)) in zip(OTHERS, lines.items()):
             axis.plot(time, error, color=colour, lw=0.8, label=label)
     _finish(axes, "t [s]", "error [%]")
-    return _save(figure, path)
+    return save(figure, path)
 
 
 PLOTS: dict[str, Callable[[Panels, Path], Path]] = {
@@ -165,7 +166,7 @@ def _disturbance(panels: Panels, path: Path, signal: str, label: str, scale: flo
         axis.grid(alpha=0.3)
     figure.align_ylabels()
     figure.tight_layout()
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def _panels(panels: Panels, sharey: bool = False) -> tuple[Figure, list[Axes]]:
@@ -210,8 +211,10 @@ def _finish(axes: Sequence[Axes], x: str, y: str, legend: str = "best") -> None:
     axes[0].figure.tight_layout()
 
 
-def _save(figure: Figure, path: Path) -> Path:
-    """Write the figure as PNG and free it."""
+def save(figure: Figure, path: Path) -> Path:
+    """Write the figure as PNG, its curves beside it for who wants to zoom, and free it."""
     figure.savefig(path, dpi=DOTS_PER_INCH)
+    if zoom.HAS_BOKEH:
+        zoom.write_plot(figure, path)
     plt.close(figure)
     return path

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader
 from rich import box
@@ -22,6 +23,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from piezo_control.shared import version
+from piezo_sim.experiment.zoom import plot_file
 
 GAP = 2  # blanks between the columns of a table
 EDGES = 2  # blanks around it
@@ -56,7 +58,7 @@ def write_html(
     environment = Environment(loader=PackageLoader("piezo_sim.experiment", "."), autoescape=True)
     environment.filters["is_text"] = is_text
     template = environment.get_template("report.html.j2")
-    pages = [
+    pages: list[dict[str, Any]] = [
         {
             "title": section.title,
             "text": section.text,
@@ -65,7 +67,11 @@ def write_html(
             "links": section.links,
             "is_appendix": section.is_appendix,
             "figures": [
-                {"caption": caption, "data": base64.b64encode(png.read_bytes()).decode()}
+                {
+                    "caption": caption,
+                    "data": base64.b64encode(png.read_bytes()).decode(),
+                    "plot": _plot(png),
+                }
                 for png, caption in section.figures
             ],
         }
@@ -76,10 +82,24 @@ def write_html(
         "date": f"{datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC",
         "version": f"piezo_gripper {version()}",
         "has_metrics": (path.parent / "metrics.json").exists(),
+        "script": _script() if any(f["plot"] for page in pages for f in page["figures"]) else "",
     }
     path.write_text(
         template.render(title=title, sections=pages, verdict=verdict, footer=footer, **origin)
     )
+
+
+def _plot(picture: Path) -> str:
+    """Return the curves of a picture, as a script's text may say them; empty: there are none."""
+    file = plot_file(picture)
+    return file.read_text().replace("</", "<\\/") if file.exists() else ""
+
+
+def _script() -> str:
+    """Return the library that draws curves in the page, whole: it may be opened where there is no network."""
+    from bokeh.resources import Resources
+
+    return Resources(mode="inline", components=["bokeh"]).render_js()
 
 
 def print_table(console: Console, section: Section) -> None:

@@ -29,6 +29,7 @@ from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
+from piezo_sim.experiment.plots import save
 from piezo_sim.experiment.report import Section
 from piezo_sim.plant.cantilever import CantileverParameters
 
@@ -209,9 +210,7 @@ def draw(runs: dict[str, list[Grasp]], path: Path) -> Path:
     for axis, label in zip(axes[:, 0], ("force [mN]", "opening [µm]", "temperature [°C]")):
         axis.set_ylabel(label)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return save(figure, path)
 
 
 def work(
