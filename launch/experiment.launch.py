@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A named experiment of the simulated finger over real nodes: recorded, analysed, with a report.
 
-What else the command takes goes into `arguments`: `arguments:="--params folder --controller robust,fast"`.
+What else the command takes goes into `arguments`: `arguments:="--params folder --controller robust,fast"`. It records by
+itself; who records beside it loses nothing with
+`ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`.
 """
 
 from launch import LaunchDescription

@@ -253,7 +253,7 @@ class Bench:
 
     def held(self):
         """Return the references as they stay, once they do."""
-        self.wait(lambda: all(len(r[-1].time) == 1 for r in self.references.values()))
+        self.wait(lambda: all(r and len(r[-1].time) == 1 for r in self.references.values()))
         return [r[-1].value[0] for r in self.references.values()]
 
 
@@ -267,6 +267,9 @@ def started(folder, state_timeout=4.0, speed=DEFAULTS.speed):
         bench.wait(lambda: all(s.phase == FingerState.RUNNING for s in bench.states.values()))
         # The gripper has to have met the fingers too, and felt them; until then it refuses or gives up.
         bench.wait(bench.is_open)
+        bench.held()  # the end of that has come
+        for sent in bench.references.values():
+            sent.clear()
         yield bench
     finally:
         codes = bench.close()
