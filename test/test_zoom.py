@@ -73,10 +73,12 @@ def test_a_report_draws_its_curves_without_a_network(tmp_path, browser):
     context = browser.new_context(offline=True)
     page, errors = context.new_page(), []
     page.on("pageerror", lambda error: errors.append(str(error)))
+    fetched = []
+    page.on("request", lambda request: fetched.append(request.url.split(":")[0]))
     page.goto((tmp_path / "report.html").as_uri())
     page.locator("details.zoom summary").click()
     page.wait_for_function("Bokeh.documents.length == 1")
     page.get_by_text("zoom, and read values").wait_for()
     page.wait_for_function("document.querySelector('details.zoom div').childElementCount > 0")
-    assert errors == []
+    assert errors == [] and set(fetched) <= {"file", "data"}
     context.close()
