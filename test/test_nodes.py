@@ -330,7 +330,7 @@ def test_feedforward_answers_with_the_law(neighbour, tmp_path):
 @pytest.mark.parametrize("end", ["silence", "deactivation", "SIGTERM", "SIGINT"])
 def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
     slew = 1e3  # V/s, so 20 V take 20 ms
-    parameters = {"mode": "free_running", "ramp": slew, "hold_time": 0.2}
+    parameters = {"mode": "free_running", "ramp": slew, "hold_time": 1.0}
     with node("feedforward", tmp_path, **parameters) as processes:
         voltages = neighbour.listen(Sample, "voltage")
         command = neighbour.publisher("command")
@@ -358,7 +358,7 @@ def test_feedforward_running_free_ramps_to_0_v(neighbour, tmp_path, end):
 
 @pytest.mark.shows("an input is late", "it stays away for `hold_time`")
 def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
-    parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1e3, "hold_time": 0.1}
+    parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1e3, "hold_time": 1.0}
     with node("cantilever", tmp_path, **parameters):
         states = neighbour.listen(FingerState, "state", LATCHED)
         deflections = neighbour.listen(Sample, "deflection")
