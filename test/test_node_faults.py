@@ -361,6 +361,23 @@ def test_a_loop_that_runs_free_follows_a_count_that_begins_anew(neighbour, tmp_p
     assert "counts anew" in log(tmp_path, "feedback")
 
 
+def test_a_stray_number_ahead_leaves_the_voltage_where_it_is(neighbour, tmp_path):
+    """The count then seems to begin anew; `state` is older than what was sent since."""
+    states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+    states.publish(FingerState(phase=FingerState.RUNNING))
+    with node("feedforward", tmp_path, mode="free_running", hold_time=5.0):
+        voltages = neighbour.listen(Sample, "voltage")
+        stream = Stream(neighbour, "command", 18e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 30.0)
+        stream.publisher.publish(sample(10**6, 18e-6))
+        neighbour.wait(lambda: "counts anew" in log(tmp_path, "feedforward"))
+        count = len(voltages)
+        neighbour.wait(lambda: len(voltages) > count + 5)
+        stream.timer.cancel()
+        steps = np.abs(np.diff([v.value for v in voltages]))
+    assert steps.max() <= SLEW * (1 + 1e-9)
+
+
 def test_an_uncertified_controller_is_said_loudly(neighbour, tmp_path):
     with node("feedback", tmp_path, "feedback_paper.yaml"):
         neighbour.publisher("deflection")

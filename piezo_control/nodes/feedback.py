@@ -170,7 +170,7 @@ class FeedbackNode(BlockNode):
         if not self._take_file():
             p = self.parameters
             law = self._started(p)
-            if self.active and law.parameters.name != self.law.parameters.name:
+            if law.parameters != self.law.parameters:
                 self._warn()
             self.law = law
             state = self.touch.state

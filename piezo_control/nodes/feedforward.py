@@ -59,6 +59,7 @@ class FeedforwardNode(BlockNode):
         self.expectations = self.create_publisher(Sample, "expected", LATCHED)
         self.watchdog = self.create_steady_timer(RAMP_PERIOD, self._watch, autostart=False)
         self.moved = time.monotonic()
+        self._told = -math.inf  # when `state` was heard
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures: dict[int, float] = {}  # of lock-step, by their place on the grid
         self._temperature_input: TemperatureInput | None = None
@@ -96,6 +97,7 @@ class FeedforwardNode(BlockNode):
     def _on_state(self, state: FingerState) -> None:
         is_first = self.finger is None
         super()._on_state(state)
+        self._told = time.monotonic()
         if is_first and self.active and self.sequence.next < 0:
             self._build(state.voltage)
 
@@ -108,8 +110,9 @@ class FeedforwardNode(BlockNode):
             self.say(f"waits for '{self.resolve_topic_name('state')}': the voltage that is applied")
 
     def restart(self) -> None:
-        """Begin with a homed finger at the voltage that is applied, or else at the last one."""
-        self._build(self.finger.voltage if self.finger else self.law.voltage)
+        """Begin with a homed finger at the voltage that is applied: that of `state`, or one that was sent since."""
+        is_told = self.parameters.mode == "lockstep" or self._told > self.moved
+        self._build(self.finger.voltage if self.finger and is_told else self.law.voltage)
 
     def _build(self, voltage: float) -> None:
         """Make a new law of a homed finger that was led to `voltage` (V)."""

@@ -49,10 +49,10 @@ def launched(
         need_one_for(file, [f"{place}/{name}" for name in parameters])
 
     def sources(name: str) -> list[Any]:
-        own = {**common, **parameters[name]}
+        own = parameters[name]
         if not file or not is_for(file, f"{place}/{name}"):
-            return [own]
-        return [own, file] if file_wins else [file, own]
+            return [common, own]
+        return [common, own, file] if file_wins else [common, file, own]
 
     return [
         Node(
