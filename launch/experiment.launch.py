@@ -6,8 +6,10 @@ itself; who records beside it loses nothing with
 `ros2 bag record --qos-profile-overrides-path $(ros2 pkg prefix --share piezo_gripper)/params/rosbag2_qos.yaml`.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess
+import shlex
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackagePrefix
 
@@ -18,22 +20,22 @@ ARGUMENTS = {
 }
 
 
-def generate_launch_description() -> LaunchDescription:
+def command(context: LaunchContext) -> list[ExecuteProcess]:
+    """Return the command that the arguments ask for."""
+    name, out, more = (LaunchConfiguration(argument).perform(context) for argument in ARGUMENTS)
     program = PathJoinSubstitution(
         [FindPackagePrefix("piezo_gripper"), "lib", "piezo_gripper", "experiment"]
     )
-    name, out, more = (LaunchConfiguration(argument) for argument in ARGUMENTS)
+    return [ExecuteProcess(cmd=[program, name, "--out", out, *shlex.split(more)], output="screen")]
+
+
+def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             *(
                 DeclareLaunchArgument(argument, default_value=value, description=text)
                 for argument, (value, text) in ARGUMENTS.items()
             ),
-            # The words of `arguments` are several; the shell takes them apart.
-            ExecuteProcess(
-                cmd=[["'", program, "' '", name, "' --out '", out, "' ", more]],
-                shell=True,
-                output="screen",
-            ),
+            OpaqueFunction(function=command),
         ]
     )

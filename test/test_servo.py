@@ -534,14 +534,19 @@ class Stand:
         self.waveform = self.node.create_publisher(WaveformMessage, "reference_waveform", SETPOINT)
         self.servo = None
 
-    def commission(self):
-        """Let the driver's sensor, which is reversed, be found out; return the directory of parameters."""
+    def start_commission(self):
+        """Let the driver's sensor, which is reversed, be found out; return the process and its directory."""
         out = self.folder / "commissioned"
         commission = self.start(
             "commission", "--driver", "udp", "--driver-options", f"127.0.0.1:{self.port}",
             "--write", "next_edge", "--sensor-scale", "2e-5", "--rest-voltage", "10", "--yes",
             "--out", str(out),
         )  # fmt: skip
+        return commission, out
+
+    def commission(self):
+        """Return the directory of parameters of a finger that was commissioned."""
+        commission, out = self.start_commission()
         assert commission.wait(2 * TIMEOUT) == 0, self.log("commission")
         return out
 
@@ -615,11 +620,7 @@ def stand(tmp_path):
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_to_commission_leads_the_voltage_to_rest(stand, end):
     """As soon as it goes on to the sine over the whole range; `SIGINT` twice, as of one who is in a hurry."""
-    out = stand.folder / "commissioned"
-    commission = stand.start(
-        "commission", "--driver", "udp", "--driver-options", f"127.0.0.1:{stand.port}", "--write", "next_edge",
-        "--sensor-scale", "2e-5", "--rest-voltage", "10", "--yes", "--out", str(out),
-    )  # fmt: skip
+    commission, out = stand.start_commission()
     wait(lambda: "resonance" in stand.log("commission"))
     commission.send_signal(end)
     if end == signal.SIGINT:

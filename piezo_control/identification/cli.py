@@ -195,21 +195,10 @@ def dynamics(arguments: argparse.Namespace, console: Console) -> list[Path]:
     measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("voltage")
     stored = arguments.out / "feedforward.yaml"
-    if not stored.exists():
-        return finish_dynamics(
-            "dynamics",
-            measurement,
-            measurement.voltage,
-            [measurement.voltage],
-            None,
-            arguments,
-            console,
-        )
-    static = partial(deflection_history, stored_hysteresis(stored))
-    less = [static(measurement.voltage)]
-    return finish_dynamics(
-        "dynamics", measurement, measurement.voltage, less, static, arguments, console
-    )
+    voltage = measurement.voltage
+    static = partial(deflection_history, stored_hysteresis(stored)) if stored.exists() else None
+    less = [static(voltage) if static else voltage]
+    return finish_dynamics("dynamics", measurement, voltage, less, static, arguments, console)
 
 
 def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:

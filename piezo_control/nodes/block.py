@@ -46,6 +46,11 @@ def wrong_time(sample: Sample, topic: str, parameters: Any, name: str) -> str:
     return ""
 
 
+def stray(sample: Sample, topic: str, expected: int) -> str:
+    """Say that a sample is none of the count of its topic."""
+    return f"'{topic}' brought sample {sample.number}, expected {expected}: does another node answer this topic?"
+
+
 def too_old(sample: Sample, topic: str, age_limit: float) -> str:
     """Say that a sample is older than `age_limit` (s), if its stamp says so; empty: it is not."""
     stamp = seconds(sample.header.stamp)
@@ -179,11 +184,8 @@ class BlockNode(FingerNode):
             )
             self.restart()
         elif kind == STRAY or kind == REPEATED:
-            self.get_logger().error(
-                f"'{self.INPUT}' brought sample {number}, expected {max(self.sequence.next, 0)}: "
-                "does another node answer this topic?",
-                throttle_duration_sec=1.0,
-            )
+            words = stray(sample, self.INPUT, max(self.sequence.next, 0))
+            self.get_logger().error(words, throttle_duration_sec=1.0)
             return
         if kind == FIRST and lockstep:
             if not self._is_new_run():

@@ -51,20 +51,14 @@ def write_plot(figure: Figure, picture: Path) -> None:
         place = axis.get_subplotspec()
         if place is None:
             continue
-        followed = next(
-            (panels[there][1] for there in panels if panels[there][0] in _together(axis)), None
-        )
+        shared = axis.get_shared_x_axes()
+        followed = next((p for other, p in panels.values() if shared.joined(axis, other)), None)
         panels[place.rowspan.start, place.colspan.start] = axis, _panel(axis, followed)
     rows = range(1 + max(row for row, _ in panels))
     columns = range(1 + max(column for _, column in panels))
     grid = [[panels.get((row, column), (None, None))[1] for column in columns] for row in rows]
     item = json_item(gridplot(grid, sizing_mode="stretch_width", merge_tools=True))
     plot_file(picture).write_text(json.dumps(item))
-
-
-def _together(axis: Axes) -> list[Axes]:
-    """Return the panels that share the horizontal axis of this one."""
-    return [other for other in axis.get_shared_x_axes().get_siblings(axis) if other is not axis]
 
 
 def _panel(axis: Axes, followed: Any) -> Any:

@@ -26,7 +26,7 @@ from rosgraph_msgs.msg import Clock
 
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
-from piezo_control.nodes.block import too_old, wrong_time
+from piezo_control.nodes.block import stray, too_old, wrong_time
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
@@ -232,14 +232,10 @@ class CantileverNode(FingerNode):
             else:
                 self._take(voltage)
                 self._advance()
-        elif (
-            not self.number - 2 <= voltage.number <= self.number
-        ):  # answers may come twice, and a way to rest
-            self.get_logger().error(
-                f"'voltage' brought sample {voltage.number}, expected {self.number}: does another node answer this "
-                "topic?",
-                throttle_duration_sec=1.0,
-            )
+        elif not self.number - 2 <= voltage.number <= self.number:
+            # An answer may come twice, and a way to rest has the number of an older sample.
+            words = stray(voltage, "voltage", self.number)
+            self.get_logger().error(words, throttle_duration_sec=1.0)
 
     def _take(self, voltage: Sample) -> None:
         self.limited += voltage.limited
