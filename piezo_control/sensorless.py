@@ -19,7 +19,7 @@ part within the sample, so for a finger that is its model nothing is left but th
 leaves. Where a limit acts, the models follow the voltage applied.
 
 While a controller leads the finger, its commands go through the inverse hysteresis of the same plays, and
-creep and heat follow; gain and offset of the models may slowly follow the sensor
+creep and heat follow; gain, offset and resonance of the models may slowly follow the sensor
 (:mod:`piezo_control.adaptation`), for when it is taken away. From one to the other the voltage has no bump:
 what models and controller disagree on at that moment is added to the input from then on.
 
@@ -167,7 +167,7 @@ def sensorless_coefficients(
         coldest=p.temperature_low,
         warmest=p.temperature_high,
         rest=p.rest,
-        adaptation=adaptation.discretize(p.adaptation, sample_time),
+        adaptation=adaptation.discretize(p.adaptation, p.dynamics.denominator, sample_time),
     )
 
 
@@ -180,7 +180,7 @@ def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> Senso
         hysteresis=hysteresis,
         relaxations=[0.0] * len(c.creep.retained),
         body=Body([start], degc_at_start=[start]),
-        past=[home] * len(c.taps),
+        past=[home] * shaping.longest(c.taps, 1.0 - c.adaptation.resonance_range),
         offset=[0.0],
         clipped=[0.0],
         adapted=unadapted(c.adaptation, home),
@@ -202,7 +202,7 @@ def sensorless_step(
     `share` is the part of a sample time that has passed since the last one, for the slew limit. A temperature
     that is NaN is one that is missing: the body keeps the temperature it has.
     """
-    wanted = shape(c.taps, s.past, reference) + s.offset[0]
+    wanted = shape(c.taps, s.past, reference, s.adapted.ratio[0]) + s.offset[0]
     warmth = s.body.degc[0] - REFERENCE_DEGC
     heat(c, s, temperature_degc)
     left = 0.0
@@ -261,7 +261,7 @@ def note(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: 
     creep_step(c.creep, s.relaxations, voltage, warmth)
     if c.adaptation.rate > 0.0:
         heat = thermal_deflection(c.thermal, s.body)
-        remember(s.adapted, actuated(c, s, voltage, warmth), heat)
+        remember(c.adaptation, s.adapted, actuated(c, s, voltage, warmth), heat)
 
 
 def actuated(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
@@ -326,7 +326,7 @@ class Sensorless:
         self, parameters: SensorlessParameters, sample_time: float, temperature_degc: float
     ) -> None:
         self.coefficients = sensorless_coefficients(parameters, sample_time)
-        self.delay = shaping.delay(self.coefficients.taps, sample_time)
+        self.sample_time = sample_time
         self.state = sensorless_rest(self.coefficients, temperature_degc)
         self.predicted = static(self.coefficients, self.state)
         """Static deflection (m) that the models expect at the end of the last sample."""
@@ -359,7 +359,8 @@ class Sensorless:
         """Return the voltage (V) for the command (m) of a controller, through the inverse hysteresis.
 
         After references of :meth:`step` it goes on from the voltage that is applied. To the `deflection` (m)
-        that the sensor reads at this sample gain and offset are adapted, unless it is NaN. Otherwise as there.
+        that the sensor reads at this sample gain, offset and resonance are adapted, unless it is NaN. Otherwise
+        as there.
         """
         self._check("command", command, temperature_degc)
         s = self.state
@@ -390,6 +391,12 @@ class Sensorless:
     def settle(self, temperature_degc: float) -> None:
         """Learn the temperature that the finger has been in equilibrium with since its start."""
         settle(self.coefficients, self.state, temperature_degc)
+
+    @property
+    def delay(self) -> float:
+        """Time (s) by which a shaped ramp comes late, for whoever plans ahead."""
+        c, adapted = self.coefficients, self.state.adapted
+        return shaping.delay(c.taps, self.sample_time, adapted.ratio[0])
 
     @property
     def body_degc(self) -> float:

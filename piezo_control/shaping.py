@@ -102,19 +102,31 @@ def residual_vibration(
     return np.abs(_phasors(len(taps), frequency_hz, damping_ratio, sample_time) @ taps)
 
 
-def delay(taps: Sequence[float], sample_time: float) -> float:
-    """Return the time (s) by which a shaped ramp comes late, for whoever plans ahead."""
-    return sample_time * sum(j * tap for j, tap in enumerate(taps))
+def delay(taps: Sequence[float], sample_time: float, ratio: float = 1.0) -> float:
+    """Return the time (s) by which a shaped ramp comes late, for whoever plans ahead; `ratio` as in :func:`shape`."""
+    return sample_time / ratio * sum(j * tap for j, tap in enumerate(taps))
 
 
-def shape(taps: Sequence[float], past: list[float], reference: float) -> float:
-    """Return the shaped reference of this sample; `past` has as many entries as taps, newest first."""
+def longest(taps: Sequence[float], ratio: float) -> int:
+    """Return how many past references :func:`shape` needs for ratios down to `ratio`."""
+    return math.floor((len(taps) - 1) / ratio) + 2
+
+
+def shape(taps: Sequence[float], past: list[float], reference: float, ratio: float) -> float:
+    """Return the shaped reference of this sample; `past` is newest first, as many as :func:`longest` says.
+
+    For a mode `ratio` times as fast as that of the taps they come in 1 / ratio of their time, between two
+    samples on the straight line.
+    """
     for j in range(len(past) - 1, 0, -1):
         past[j] = past[j - 1]
     past[0] = reference
     total = 0.0
     for j in range(len(taps)):
-        total += taps[j] * past[j]
+        place = j / ratio
+        i = int(place)
+        part = place - i
+        total += taps[j] * ((1.0 - part) * past[i] + part * past[i + 1])
     return total
 
 

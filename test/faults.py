@@ -157,6 +157,8 @@ def let_go_wrong(bench: Bench, cores: int) -> None:
         ):  # what was told to end may leave a finger that is at rest or waits for it, by name
             if "cantilever" in bench.ended or state.phase == FingerState.WAITING and state.text:
                 return True
+        if "came up after this node started" in state.text:
+            return state.phase == FingerState.WAITING and state.voltage == 0.0
         is_near = abs(state.deflection - TARGET) < NEAR[bench.lockstep]
         is_new = state.samples > before + moving or state.samples < before
         return state.phase == FingerState.RUNNING and is_new and is_near

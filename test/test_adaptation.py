@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from piezo_control import adaptation
 from piezo_control.adaptation import AdaptationParameters, adapt, remember, unadapted
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import read_controller
 from piezo_control.hysteresis import HysteresisParameters
 from piezo_control.profile import Profile
@@ -20,6 +21,7 @@ from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
 H = 1e-4
+DENOMINATOR = DynamicsParameters().denominator
 GAIN, OFFSET = 1.06, -0.4e-6
 ON = AdaptationParameters(time_constant=0.5)
 
@@ -27,14 +29,14 @@ ON = AdaptationParameters(time_constant=0.5)
 def test_gain_and_offset_of_a_finger_that_moves_come_back():
     """y_k = GAIN A_j + g_j + OFFSET, j = k - d - 1, is what the readings are made by."""
     parameters = replace(ON, delay_samples=2)
-    a = adaptation.discretize(parameters, H)
+    a = adaptation.discretize(parameters, DENOMINATOR, H)
     state = unadapted(a, 0.0)
     made = [(0.0, 0.0)] * 3
     for k in range(100_000):
         actuated, heat = made[k]
         adapt(a, state, GAIN * actuated + heat + OFFSET)
         made.append((20e-6 * math.sin(k * H * 2.0 * math.pi), 1e-6 * math.sin(k * H)))
-        remember(state, *made[-1])
+        remember(a, state, *made[-1])
     assert state.gain[0] == pytest.approx(GAIN, abs=1e-6)
     assert state.offset[0] == pytest.approx(OFFSET, abs=1e-10)
 
@@ -42,10 +44,10 @@ def test_gain_and_offset_of_a_finger_that_moves_come_back():
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-1e-3, 1e-3), st.floats(-1e-3, 1e-3)), max_size=50))
 def test_no_reading_leads_out_of_the_bounds(readings):
-    a = adaptation.discretize(replace(ON, time_constant=1e-6), H)
+    a = adaptation.discretize(replace(ON, time_constant=1e-6), DENOMINATOR, H)
     state = unadapted(a, 0.0)
     for actuated, deflection in readings:
-        remember(state, actuated, 0.0)
+        remember(a, state, actuated, 0.0)
         adapt(a, state, deflection)
         assert abs(state.gain[0] - 1.0) <= ON.gain_range + 1e-15
         assert abs(state.offset[0]) <= ON.offset_range

@@ -7,7 +7,14 @@ import pytest
 from piezo_control import shaping
 from piezo_control.dynamics import DynamicsParameters, Motion, move, propagator
 from piezo_control.parameters import ParameterError
-from piezo_control.shaping import ShapingParameters, delay, residual_vibration, shape, shaper
+from piezo_control.shaping import (
+    ShapingParameters,
+    delay,
+    longest,
+    residual_vibration,
+    shape,
+    shaper,
+)
 
 H = 1e-4
 A2, A1, _ = DENOMINATOR = DynamicsParameters().denominator
@@ -20,9 +27,9 @@ def vibration_after_a_step(taps, resonance=1.0, damping=1.0):
     free = propagator(a2, a1, 1.0, H)
     amplitudes = []
     for each in (taps, [1.0]):
-        motion, past = Motion([0.0], [0.0]), [0.0] * len(each)
+        motion, past = Motion([0.0], [0.0]), [0.0] * longest(each, 1.0)
         for _ in range(len(taps)):
-            move(motion, free, shape(each, past, 1.0))
+            move(motion, free, shape(each, past, 1.0, 1.0))
         # The complex amplitude of the mode with the poles p, p*: (v - conj(p) (x - 1)) / (p - conj(p))
         pole = complex(-0.5 * a1 / a2, np.sqrt(1.0 / a2 - (0.5 * a1 / a2) ** 2))
         amplitudes.append(abs(motion.v[0] - pole.conjugate() * (motion.x[0] - 1.0)))
@@ -77,8 +84,8 @@ def test_least_time_keeps_its_bound_over_the_box_and_is_shorter_than_2_ms(larges
 
 def test_a_ramp_comes_late_by_the_delay():
     taps = shaper(ShapingParameters(), DENOMINATOR, H)
-    past = [0.0] * len(taps)
-    ramp = [shape(taps, past, k * H) for k in range(50)]
+    past = [0.0] * longest(taps, 1.0)
+    ramp = [shape(taps, past, k * H, 1.0) for k in range(50)]
     assert ramp[-1] == pytest.approx(49 * H - delay(taps, H), abs=1e-15)
 
 

@@ -30,6 +30,7 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from piezo_control.nodes import spin
+from piezo_control.nodes.network import Networks
 from piezo_control.parameters import (
     OF_EVERY_NODE,
     ParameterError,
@@ -117,6 +118,7 @@ class FingerNode(LifecycleNode):
         self._origins: dict[
             str, str
         ] = {}  # of parameters: what they are of, and where they come from
+        self._networks = Networks()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self.publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
@@ -136,6 +138,12 @@ class FingerNode(LifecycleNode):
         if text != self._said:
             self._said = text
             self.get_logger().info(text)
+
+    def missed_networks(self) -> str:
+        """Say which networks this node does not hear, because they came up after it started; and log it once."""
+        if missed := self._networks.missed():
+            self.get_logger().warning(missed, once=True)
+        return missed
 
     def comes_from(self, what: str, path: str | Path) -> None:
         """Say where the values of a file come from, here and on `/diagnostics`, if it says it; empty: of no file."""
@@ -225,6 +233,8 @@ class FingerNode(LifecycleNode):
         """Publish the state of this node on `/diagnostics`."""
         wrong, figures = self.report()
         figures = figures | {f"{what} from": words for what, words in self._origins.items()}
+        if missed := self.missed_networks():
+            figures |= {"not heard": missed}
         if self._refused:
             figures |= {"refused": self._refused, "last refusal": self._refusal}
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), hardware_id="piezo_gripper")

@@ -184,7 +184,7 @@ class BlockNode(FingerNode):
             )
             self.restart()
         elif kind == STRAY or kind == REPEATED:
-            words = stray(sample, self.INPUT, max(self.sequence.next, 0))
+            words = stray(sample, self.INPUT, max(self.sequence.next, 0)) + self._input.others()
             self.get_logger().error(words, throttle_duration_sec=1.0)
             return
         if kind == FIRST and lockstep:
@@ -202,12 +202,12 @@ class BlockNode(FingerNode):
                 )
                 return  # the cantilever asks again
         if wrong := wrong_time(sample, self.INPUT, self.parameters, self.NAME):
-            self.trip(wrong)
+            self.trip(wrong + self._input.others())
             return
         if not is_physical(sample.value, self.LARGEST):
             self.get_logger().error(
                 f"'{self.INPUT}' sample {number} is {sample.value}, must be finite and within "
-                f"±{self.LARGEST:g}; not answered",
+                f"±{self.LARGEST:g}; not answered{self._input.others()}",
                 throttle_duration_sec=1.0,
             )
             return

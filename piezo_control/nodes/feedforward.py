@@ -240,7 +240,11 @@ class FeedforwardNode(BlockNode):
             wrong = wrong or self.thermometer.wrong
             if self.parameters.adaptation.time_constant:
                 adapted = self.law.state.adapted
-                figures |= {"adapted gain": adapted.gain[0], "adapted offset": adapted.offset[0]}
+                figures |= {
+                    "adapted gain": adapted.gain[0],
+                    "adapted offset": adapted.offset[0],
+                    "adapted resonance": adapted.ratio[0],
+                }
         return wrong, figures
 
     def reset(self) -> None:

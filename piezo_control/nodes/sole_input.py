@@ -48,9 +48,18 @@ class SoleInput:
         """Return what is wrong with the publishers: several, or one that cannot be heard; else nothing."""
         if self._count == 0 and self._unfit and self._node.count_publishers(self._topic):
             return f"'{self._topic}' is published by {self._names()} with {self._unfit}"
-        if self._count <= 1:
-            return ""
-        return f"'{self._topic}' has {self._count} publishers: {self._names()}"
+        return self._several(self._count)
+
+    def others(self) -> str:
+        """Return a half-sentence on who else publishes, for a sample that nobody should have sent; empty: nobody.
+
+        Asked of the graph, which may know a publisher before its match is told.
+        """
+        several = self._several(self._node.count_publishers(self._topic))
+        return several and f"; {several}"
+
+    def _several(self, count: int) -> str:
+        return f"'{self._topic}' has {count} publishers: {self._names()}" if count > 1 else ""
 
     def _names(self) -> str:
         # The name of a node that has just started may not be known yet.

@@ -223,18 +223,18 @@ class CantileverNode(FingerNode):
             self._hold(voltage)
         elif voltage.number == self.number and self.pending_voltage is None:
             if wrong := wrong_time(voltage, "voltage", self.parameters, self.NAME):
-                self._fault(wrong)
+                self._fault(wrong + self.voltages.others())
             elif not is_physical(voltage.value, LARGEST_VOLTAGE):
                 self._fault(
                     f"'voltage' sample {voltage.number} is {voltage.value} V, must be finite and within "
-                    f"±{LARGEST_VOLTAGE:g} V"
+                    f"±{LARGEST_VOLTAGE:g} V{self.voltages.others()}"
                 )
             else:
                 self._take(voltage)
                 self._advance()
         elif not self.number - 2 <= voltage.number <= self.number:
             # An answer may come twice, and a way to rest has the number of an older sample.
-            words = stray(voltage, "voltage", self.number)
+            words = stray(voltage, "voltage", self.number) + self.voltages.others()
             self.get_logger().error(words, throttle_duration_sec=1.0)
 
     def _take(self, voltage: Sample) -> None:
@@ -300,7 +300,11 @@ class CantileverNode(FingerNode):
             topics = {"command": "feedback", "voltage": "feedforward"}
         for topic, node in topics.items():
             if not self.count_publishers(topic):
-                return f"node '{node}' is gone: nobody publishes '{self.resolve_topic_name(topic)}'"
+                missed = self.missed_networks()
+                return (
+                    f"node '{node}' is gone: nobody publishes '{self.resolve_topic_name(topic)}'"
+                    f"{missed and f'; {missed}'}"
+                )
         silent = " or ".join(f"'{self.resolve_topic_name(topic)}'" for topic in topics)
         return f"{silent} is published but silent; is the node active?"
 
@@ -312,10 +316,11 @@ class CantileverNode(FingerNode):
         if self.guard.is_latched:
             return
         if wrong := wrong_time(voltage, "voltage", self.parameters, self.NAME):
-            self._fault(wrong)
+            self._fault(wrong + self.voltages.others())
         elif not is_physical(voltage.value, LARGEST_VOLTAGE):
             self.get_logger().error(
-                f"'voltage' is {voltage.value} V, must be finite and within ±{LARGEST_VOLTAGE:g} V; ignored",
+                f"'voltage' is {voltage.value} V, must be finite and within ±{LARGEST_VOLTAGE:g} V; ignored"
+                f"{self.voltages.others()}",
                 throttle_duration_sec=1.0,
             )
         elif old := too_old(voltage, "voltage", self.parameters.age_limit):
