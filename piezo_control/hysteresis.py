@@ -31,7 +31,6 @@ Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -321,19 +320,20 @@ def inverse_follow(operator: Coefficients, inverse: Coefficients, s: State, volt
 
 
 def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[float, float]:
-    """Return the deflections (m) at which a homed actuator arrives with `low` and `high` (V).
+    """Return the deflections (m) that are reached between `low` and `high` (V), whatever came before.
 
+    That is the ends of the loop over the whole range. An actuator that is driven to one side only does not come
+    back to where it was homed; one whose range is the same on both sides arrives at the same ends from there.
     Beyond them the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
     """
-
-    def arrive(voltage: float) -> float:
-        hysteresis = sum(
-            weight * max(abs(voltage) - threshold, 0.0)
-            for weight, threshold in zip(operator.weights, operator.thresholds, strict=True)
-        )
-        return dead_zones(operator, math.copysign(hysteresis, voltage))
-
-    return arrive(low), arrive(high)
+    plays = [0.0] * len(operator.weights)
+    ends = []
+    for voltage in (low, high, low, high):
+        for i, threshold in enumerate(operator.thresholds):
+            plays[i] = max(voltage - threshold, min(voltage + threshold, plays[i]))
+        hysteresis = sum(w * play for w, play in zip(operator.weights, plays, strict=True))
+        ends.append(dead_zones(operator, hysteresis))
+    return ends[2], ends[3]
 
 
 def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:

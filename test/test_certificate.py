@@ -25,7 +25,7 @@ from piezo_control.design.certificate import (
 from piezo_control.design.cli import finger_origin, main, read_problem
 from piezo_control.design.problem import DesignProblem, TransferFunction, Uncertainty
 from piezo_control.design.synthesis import synthesize
-from piezo_control.feedback import FeedbackParameters
+from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.parameters import build, declarations, dump, load
 
 PARAMS = Path(__file__).resolve().parents[1] / "params"
@@ -300,7 +300,9 @@ def test_a_finger_that_was_not_identified_is_not_certified(tmp_path, command_lin
     lines = finger_origin(robust, path, ("dynamics", "limits")).splitlines()
     assert lines == [
         "finger, dynamics: ASSUMED, the paper's", f"finger, hysteresis: from {path}",
-        "finger, limits: ASSUMED, the paper's", "hysteresis identified from mine.csv: rms 0.5 %",
+        "finger, limits: ASSUMED, the paper's", "finger, heat: ASSUMED, the paper's",
+        "finger, delay: ASSUMED, the paper's", "finger, sample time: ASSUMED, the paper's",
+        "finger, amplifier's lag: ASSUMED, the paper's", "hysteresis identified from mine.csv: rms 0.5 %",
     ]  # fmt: skip
 
 
@@ -314,18 +316,31 @@ def test_an_identified_finger_replaces_that_of_the_problem(tmp_path):
     assert p.finger.delay_samples == 1
 
 
-def test_reach_and_drift_are_those_of_the_identified_finger(tmp_path):
+@pytest.mark.parametrize("sensitivity", [2e-7, -2e-7])
+def test_reach_and_drift_are_those_of_the_identified_finger(tmp_path, sensitivity):
     """One play without threshold, 1 µm/V within −10 to 20 V: −10 to 20 µm; 2e-7 + 0.01 * 20 µm per degree."""
     plant = {
         "hysteresis": {"thresholds": [0.0], "weights": [1e-6]},
         "amplifier": {"voltage_low": -10.0, "voltage_high": 20.0},
-        "thermal": {"sensitivity": 2e-7, "gain_per_degc": 0.01},
+        "thermal": {"sensitivity": sensitivity, "gain_per_degc": 0.01},
     }
     identified = tmp_path / "cantilever.yaml"
     identified.write_text(yaml.safe_dump({"/**/cantilever": {"ros__parameters": plant}}))
     p = read_problem(PARAMS / "synthesis_robust.yaml", identified)
     assert (p.finger.command_low, p.finger.command_high) == pytest.approx((-10e-6, 20e-6))
     assert p.finger.drift_per_degc == pytest.approx(4e-7)
+
+
+def test_drift_of_a_loop_that_does_not_integrate_counts_until_the_end():
+    """The paper's K is no integrator: what stays is the drift over 1 + K(1), however slowly it comes."""
+    path = PARAMS / "synthesis_paper.yaml"
+    problem = build(DesignProblem, load(path, "synthesize"))
+    finger = dataclasses.replace(problem.finger, drift_time_constant=100.0)
+    p = read_controller("paper")
+    at_rest = np.linalg.solve(np.eye(p.order) - p.matrix("a"), p.matrix("b"))
+    box = Box(dataclasses.replace(problem, finger=finger), 1, 1, 3, 50)
+    stays = finger.drift_per_degc / (1.0 + box.fingers.gain * (p.matrix("c") @ at_rest + p.d))
+    assert box.figures(p).drift == pytest.approx(stays, rel=1e-3)
 
 
 @pytest.mark.parametrize("path", sorted(PARAMS.glob("s*.yaml")), ids=lambda path: path.name)

@@ -118,7 +118,7 @@ def test_a_delay_is_found_and_is_not_taken_for_damping(late):
     measurement = measured(step(20.0, 800), np.zeros(800))
     shifted = np.concatenate((np.zeros(late), measurement.deflection))[:800]
     model = identify_dynamics(replace(measurement, deflection=shifted), measurement.voltage)
-    assert model.delay_samples == late
+    assert model.delay_samples(measurement.sample_time) == late
     assert model.natural_frequency == pytest.approx(FREQUENCY, rel=0.005)
     assert model.damping_ratio == pytest.approx(DAMPING, rel=0.1)
 
@@ -187,7 +187,7 @@ def test_the_lag_of_an_amplifier_is_told_from_hysteresis_damping_and_delay(
         replace(measurement, deflection=shifted), measurement.voltage, 3, static
     )
     assert model.bandwidth_hz == pytest.approx(bandwidth_hz, rel=2e-3)
-    assert model.delay_samples == late
+    assert model.delay_samples(measurement.sample_time) == late
     assert len(model.modes) == len(modes.share)
     assert model.natural_frequency == pytest.approx(FREQUENCY, rel=1e-4)
     assert model.damping_ratio == pytest.approx(DAMPING, rel=0.01)

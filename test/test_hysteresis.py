@@ -194,6 +194,16 @@ def test_reachable_range_is_reached_and_not_passed():
     assert actuator.step(-LIMIT) == pytest.approx(low, rel=1e-12)
 
 
+@given(st.floats(0.0, 30.0), st.floats(31.0, 150.0))
+def test_an_actuator_driven_to_one_side_reaches_the_ends_of_its_loop(low, high):
+    """Where it was homed it does not come back to: the lower end is that of the loop."""
+    actuator = Hysteresis(HysteresisParameters())
+    ends = reachable_range(coefficients(HysteresisParameters(), 1.0), low, high)
+    passed = [actuator.step(voltage) for voltage in (low, high, low, high)]
+    assert passed[2:] == pytest.approx(ends, rel=1e-12)
+    assert passed[0] <= passed[2] + 1e-18
+
+
 def test_rate_dependence_widens_the_loop_by_the_threshold():
     """One play at a constant rate lags by r + b |du/dt| when moving up."""
     parameters = HysteresisParameters((0.0, 1.0), (1e-7, 1e-7), rate_coefficient=0.02)

@@ -101,7 +101,7 @@ class Box:
         self.frequency = frequency_grid(step, (1 - reach) * omega, (1 + reach) * omega, points)
         self.z = np.exp(1j * self.frequency * step)
         self.plant = finger_response(self.fingers, self.z)
-        self.weight = unmodelled_weight(problem.uncertainty, step, self.frequency * step)
+        self.weight = unmodelled_weight(problem, self.frequency * step)
         self.samples = math.ceil(RECORD_SETTLING_TIMES * problem.specification.settling_time / step)
 
     def radius(self, controller: FeedbackParameters) -> tuple[np.ndarray, np.ndarray]:
@@ -157,13 +157,15 @@ class Box:
         """Return the largest deflection per degree (m/°C) after a step of the temperature.
 
         The tip drifts away with the lag of the body. The loop is so much faster that the largest
-        deflection comes while the drift is nearly a ramp, within the record.
+        deflection comes while the drift is nearly a ramp, within the record, or, of a loop that does not integrate,
+        at the end: from the one to the other what is left follows the lag.
         """
         model = self.problem.finger
         readings = respond(
             loop, "drift", self.samples, model.drift_time_constant, model.sample_time
         )
-        return model.drift_per_degc * np.abs(readings).max(axis=1)
+        at_the_end = np.abs(static_gain(loop, "drift"))
+        return model.drift_per_degc * np.maximum(np.abs(readings).max(axis=1), at_the_end)
 
     def cost(self, controller: FeedbackParameters, reserve: float) -> float:
         """Return what tuning minimises: relative settling time plus penalties.

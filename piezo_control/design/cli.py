@@ -110,6 +110,13 @@ BLOCKS = {
     "limits": ("amplifier.voltage_low", "amplifier.voltage_high"),
 }
 """What a certificate rests upon, and the parameters of a cantilever that say it."""
+BESIDE = {
+    "heat": ("thermal.sensitivity",),
+    "delay": ("sensor.delay_samples",),
+    "sample time": ("sample_time",),
+    "amplifier's lag": ("amplifier.bandwidth_hz",),
+}
+"""What it rests upon, too, and may do without, when it says so."""
 ASSUMED = "ASSUMED, the paper's"
 
 
@@ -131,8 +138,8 @@ def finger_origin(problem: Path, cantilever: Path | None, assume: Sequence[str] 
             f"and {BLOCKS['limits'][1]} are yours to write; or --assume {' '.join(refused)}"
         )
     lines = [
-        f"finger, {block}: " + (ASSUMED if block in missing else f"from {cantilever}")
-        for block in BLOCKS
+        f"finger, {block}: " + (f"from {cantilever}" if all(n in said for n in names) else ASSUMED)
+        for block, names in (BLOCKS | BESIDE).items()
     ]
     # What `identify` and `commission` say of their fits.
     lines += [line[2:] for line in cantilever.read_text().splitlines() if line.startswith("# ")]
@@ -179,7 +186,7 @@ def _of_reach_and_heat(identified: Mapping[str, Any], source: str) -> dict[str, 
     operator = coefficients(part(HysteresisParameters, "hysteresis"), sample_time=1.0)
     low, high = reachable_range(operator, voltage.voltage_low, voltage.voltage_high)
     thermal = part(ThermalParameters, "thermal")
-    drift = thermal.sensitivity + abs(thermal.gain_per_degc) * max(-low, high)
+    drift = abs(thermal.sensitivity) + abs(thermal.gain_per_degc) * max(-low, high)
     return {
         "finger.command_low": low,
         "finger.command_high": high,

@@ -321,11 +321,12 @@ def settling(readings: np.ndarray, sample_time: float, target: float, band: floa
     return time
 
 
-def static_gain(loop: ClosedLoop) -> np.ndarray:
-    """Return the reading per reference at rest, for each finger."""
+def static_gain(loop: ClosedLoop, source: str = "reference") -> np.ndarray:
+    """Return the reading at rest per unit at `source` (see :func:`respond`), for each finger."""
     size = loop.a.shape[1]
-    rest = np.linalg.solve(np.eye(size) - loop.a, loop.b_reference[:, :, None])
-    return rest[:, :, 0] @ loop.c_reading
+    rest = np.linalg.solve(np.eye(size) - loop.a, getattr(loop, f"b_{source}")[:, :, None])
+    direct = float(source == "drift" and loop.delay == 0)
+    return rest[:, :, 0] @ loop.c_reading + direct
 
 
 def frequency_grid(

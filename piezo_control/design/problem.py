@@ -49,7 +49,7 @@ class FingerModel:
         low=0.0,
     )
     drift_time_constant: float = parameter(
-        0.3, "lag of that deflection behind the temperature", unit="s", low=1e-3, high=1e4
+        0.3, "lag of that deflection behind the temperature; 0: none", unit="s", low=0.0, high=1e4
     )
 
     def __post_init__(self) -> None:

@@ -7,7 +7,8 @@ family is stable and
     1 + K(z) (g G(z) + Delta(z)) != 0    for every z on the unit circle, every finger, every Delta,
 
 all of them are. G has resonance and damping ratio of the box, g its gain, and Delta is any stable dynamics
-with |Delta| <= W, the weight of what nobody modelled. That follows from, and the sensitivity is at most Ms by,
+with |Delta| <= W, the weight of what nobody modelled behind the largest gain. Its static share is taken from the
+first mode, so G is that of the box times 1 ± share / first; what that is too much for the other modes is in W. That follows from, and the sensitivity is at most Ms by,
 
     |1 + g K G| > |K| W        and        |1 + g K G| >= 1 / Ms.
 
@@ -16,7 +17,8 @@ Frequency, resonance and damping ratio are cut into cells (interval analysis). I
     |dT| <= (|dp| |1 - zc| + |dz| |1 - pc|) / (|zc - pc| (|zc - pc| - |dz| - |dp|)),    T = (1 - p) / (z - p),
 
 for each pole p of the sampled finger, K by the same rule for its residues, and the gain's interval is
-exact: a line in the complex plane. A cell that proves nothing is cut in two. Unlike the upper bound of the
+exact: a line in the complex plane. Where poles of the finger meet, because it may hardly ring, its resolvent is
+bounded instead: |dR| <= |R|² d / (1 - |R| d), d the change of z - A. A cell that proves nothing is cut in two. Unlike the upper bound of the
 structured singular value this leaves no gap: it ends with a proof, or with a finger that violates.
 
 Sources: Ackermann, Robust Control (Springer 2002), ch. 4 (zero exclusion); Moore, Kearfott, Cloud,
@@ -25,14 +27,16 @@ Introduction to Interval Analysis (SIAM 2009), ch. 6.
 
 from __future__ import annotations
 
+import cmath
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from piezo_control.design.problem import DesignProblem, FingerModel, Uncertainty
+from piezo_control.design.problem import DesignProblem, FingerModel
 from piezo_control.feedback import FeedbackParameters
 
+RINGING = 0.9  # damping ratio up to which the poles are far enough apart
 MOST_CELLS = 4_000_000
 INTEGRATOR = 1e-9  # a pole so near to 1 is one
 RESIDUES = 1e-7  # relative; more than that is lost when poles coincide
@@ -48,31 +52,43 @@ class Proof(NamedTuple):
     why: str
 
 
-def unmodelled_weight(
-    uncertainty: Uncertainty, sample_time: float, angle: np.ndarray
-) -> np.ndarray:
+def unmodelled_weight(problem: DesignProblem, angle: np.ndarray) -> np.ndarray:
     """Return W at `angle` (rad per sample): what the worst mode that nobody modelled can add.
 
     Over all modes from `unmodelled_from_hz` on, those beyond the Nyquist frequency too, which the hold
-    attenuates and the sampling folds down: their largest response to a held command, times the share.
+    attenuates and the sampling folds down: their largest response to a held command, times the share and the
+    largest gain.
     """
-    u = uncertainty
+    u, sample_time = problem.uncertainty, problem.finger.sample_time
     if u.unmodelled_share == 0.0:
         return np.zeros_like(angle)
     lowest = 2.0 * math.pi * u.unmodelled_from_hz * sample_time
+    z = np.exp(1j * angle)
+
+    def response(pole: complex, damping: float) -> np.ndarray:
+        part = 0.5 - 0.5j * damping / math.sqrt(1.0 - damping**2)
+        alone = part * (1.0 - pole) / (z - pole)
+        other = np.conj(pole)
+        return alone + np.conj(part) * (1.0 - other) / (z - other)
+
     # A quarter of a mode's half width per step, up to where the hold has made it harmless.
     steps = np.exp(np.arange(0.0, math.log(20.0), 0.25 * u.unmodelled_damping))
-    ringing = math.sqrt(1.0 - u.unmodelled_damping**2)
-    pole = np.exp(lowest * steps * complex(-u.unmodelled_damping, ringing))
-    part = 0.5 - 0.5j * u.unmodelled_damping / ringing
-    z = np.exp(1j * angle)
     largest = np.zeros_like(angle)
-    for p in pole:
-        response = part * (1.0 - p) / (z - p) + np.conj(part) * (1.0 - np.conj(p)) / (
-            z - np.conj(p)
-        )
-        np.maximum(largest, np.abs(response), out=largest)
-    return u.unmodelled_share * largest
+    for omega in lowest * steps:
+        pole = _pole(omega, u.unmodelled_damping)
+        np.maximum(largest, np.abs(response(pole, u.unmodelled_damping)), out=largest)
+    modelled = np.zeros_like(z)
+    modes = problem.finger.modes
+    for hertz, damping, share in zip(modes.frequency_hz, modes.damping, modes.share):
+        pole = _pole(2.0 * math.pi * hertz * sample_time, damping)
+        modelled += share * response(pole, damping)
+    beside = np.abs(modelled) / (1.0 - sum(modes.share))
+    return u.gain_high * u.unmodelled_share * (largest + beside)
+
+
+def _pole(angle: float, damping: float) -> complex:
+    """Return the sampled pole of a mode whose natural frequency is `angle` (rad per sample)."""
+    return cmath.exp(angle * complex(-damping, math.sqrt(1.0 - damping**2)))
 
 
 class Loop(NamedTuple):
@@ -108,19 +124,18 @@ def prove(
     model, u = problem.finger, problem.uncertainty
     a2, a1, _ = model.denominator
     natural, ratio = 1.0 / math.sqrt(a2), 0.5 * a1 / math.sqrt(a2)
-    if ratio * u.damping_high >= 0.99:
-        return Proof(False, 0, "the box has fingers that do not ring; there is no proof for them")
     loop = _partial_fractions(controller, model)
     if loop is None:
         return Proof(False, 0, "poles of the controller coincide; there is no proof for it")
     share = u.unmodelled_share if unmodelled else 0.0
-    gain = u.gain_low * (1.0 - share), u.gain_high * (1.0 + share)
+    change = share / (1.0 - sum(model.modes.share))
+    gain = u.gain_low * (1.0 - change), u.gain_high * (1.0 + change)
     edges = np.linspace(0.0, math.pi, BINS + 1)
     first = BINS // COARSEST
     weight = np.zeros(BINS)
     if share:
         # The weight between two points, from the finer ones in between.
-        fine = unmodelled_weight(u, model.sample_time, np.linspace(0.0, math.pi, 8 * BINS + 1))
+        fine = unmodelled_weight(problem, np.linspace(0.0, math.pi, 8 * BINS + 1))
         weight = 1.01 * np.maximum.reduceat(fine[:-1], np.arange(0, 8 * BINS, 8))
         weight = unmodelled * np.maximum(weight, 1.01 * fine[8::8])
     start = np.array(
@@ -195,20 +210,25 @@ def _bounds(
             k = loop.integral + factor * k
         # Finger: the first mode of the box, then the fixed ones.
         zeta_edge = cells[5]
-        ringing = np.sqrt(1.0 - middle[2] ** 2)
-        p = np.exp(h * middle[1] * (-middle[2] + 1j * ringing))
         of_resonance = h * half[1] * np.ones_like(dz)
-        of_damping = h * cells[3] * half[2] / np.sqrt(1.0 - zeta_edge**2)
-        part = 0.5 - 0.5j * middle[2] / ringing
-        part_off = 0.5 * half[2] / (1.0 - zeta_edge**2) ** 1.5
         first = 1.0 - sum(model.modes.share)
-        g, g_off = _mode(z, dz, p, of_resonance + of_damping, part, part_off)
+        if np.all(zeta_edge < RINGING):
+            ringing = np.sqrt(1.0 - middle[2] ** 2)
+            p = np.exp(h * middle[1] * (-middle[2] + 1j * ringing))
+            of_damping = h * cells[3] * half[2] / np.sqrt(1.0 - zeta_edge**2)
+            part = 0.5 - 0.5j * middle[2] / ringing
+            part_off = 0.5 * half[2] / (1.0 - zeta_edge**2) ** 1.5
+            g, g_off = _mode(z, dz, p, of_resonance + of_damping, part, part_off)
+        else:
+            of_resonance = (1.0 + 2.0 * zeta_edge) * of_resonance
+            of_damping = 2.0 * h * cells[3] * half[2]
+            g, g_off = _damped_mode(z, dz, h * middle[1], middle[2], of_resonance + of_damping)
         g, g_off = first * g, abs(first) * g_off
         for hertz, zeta, share in zip(
             model.modes.frequency_hz, model.modes.damping, model.modes.share
         ):
             ring = math.sqrt(1.0 - zeta**2)
-            own = np.full_like(z, np.exp(h * 2.0 * math.pi * hertz * complex(-zeta, ring)))
+            own = np.full_like(z, _pole(2.0 * math.pi * hertz * h, zeta))
             more, more_off = _mode(z, dz, own, 0.0 * dz, 0.5 - 0.5j * zeta / ring, 0.0)
             g, g_off = g + share * more, g_off + abs(share) * more_off
         lag = math.exp(-2.0 * math.pi * model.amplifier_bandwidth_hz * h)
@@ -258,6 +278,27 @@ def _mode(
         total = total + factor * t
         off = off + np.abs(factor) * t_off + part_off * (np.abs(t) + t_off)
     return total, off
+
+
+def _damped_mode(
+    z: np.ndarray, dz: np.ndarray, angle: np.ndarray, zeta: np.ndarray, da: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mode of natural frequency `angle` (rad per sample), and by how much it varies in the cell.
+
+    Any damping ratio: 1 - (z - 1) R, R the first entry of (z - A)^-1, A = exp(angle [[0, 1], [-1, -2 zeta]]), which
+    varies by `da` at most.
+    """
+    ringing = np.emath.sqrt(1.0 - zeta**2) + 0j
+    envelope = np.exp(-zeta * angle)
+    even = envelope * np.cos(ringing * angle).real
+    odd = envelope * (angle * np.sinc(ringing * angle / np.pi)).real
+    above, below = z - even - zeta * odd, z - even + zeta * odd
+    determinant = above * below + odd**2
+    size = np.sqrt(np.abs(above) ** 2 + np.abs(below) ** 2 + 2.0 * odd**2) / np.abs(determinant)
+    d = dz + da
+    change = np.where(size * d < 1.0, size**2 * d / (1.0 - size * d), np.inf)
+    off = np.abs(z - 1.0) * change + dz * (size + change)
+    return 1.0 - (z - 1.0) * below / determinant, off
 
 
 def _cut(cells: np.ndarray, cost: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 """From recordings of a finger to the parameters its nodes load.
 
 Reads rosbag2 folders, text files and those of other programs; a row of a table has a deflection beside the voltage
-that was held until then (a delay of whole rows is found). Writes into one folder (--out), step by step:
+that was held until then (the delay is found). Writes into one folder (--out), step by step:
 feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.yaml (`hysteresis`,
 `dynamics`, `stiffness`, `drift`), a picture and the fit's figures (JSON) of each step. After `hysteresis
 --model classical`, `dynamics` and `drift`, feedforward.yaml has all that `compensator: sensorless` needs.
@@ -26,6 +26,7 @@ from rich.table import Table
 
 from piezo_control.creep import CreepParameters
 from piezo_control.dynamics import DynamicsParameters, ModesParameters
+from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
@@ -64,6 +65,8 @@ GROUPS = {
     "thermal": ThermalParameters,
 }
 """Of the cantilever's parameters, those that are identified."""
+LIMITS_COMMENT = """The limits of the voltage are no result of a measurement: they are the defaults until you write what
+your actuator stands."""
 SENSOR_COMMENT = """The deflection shows lag seconds late and with the offset of the sensor; both are no part of the
 operator, and the feedforward does not use them. For `identify check`."""
 
@@ -138,6 +141,8 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     )
     found = flatten(feedforward)
     build(FeedforwardParameters, found, str(arguments.recording))
+    # What is there of other identifications, and the limits that somebody wrote, stay.
+    limits = {n: v for n, v in found.items() if "." not in n and n != "static_gain"}
     whole = fits[f"all {last - first} samples, fitted"]
     comment = said(
         "hysteresis",
@@ -148,14 +153,10 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     )
     operator = {"hysteresis": flatten(model.parameters)}
     written = update(arguments.out / "cantilever.yaml", "hysteresis", comment, operator)
-    dump(
-        path,
-        "feedforward",
-        found,
-        f"{comment}\n"
-        "The limits of the voltage are no result of a measurement: they are the defaults until you write what\n"
-        "your actuator stands.",
-    )
+    if not path.exists():
+        dump(path, "feedforward", limits, LIMITS_COMMENT)
+    inverse = {"": {"static_gain": feedforward.static_gain}, **operator}
+    update(path, "hysteresis", comment, inverse)
     sensor = arguments.out / "identification.yaml"
     dump(sensor, "identification", {"lag": model.lag, "offset": model.offset}, SENSOR_COMMENT)
     picture = arguments.out / "hysteresis.png"
@@ -239,10 +240,12 @@ def finish_dynamics(
     fits = {"all samples, fitted": fit}
     show(console, f"{name} of {arguments.recording}", fits)
     need(str(arguments.recording), fits, "a finger without vibration" if less else "no force")
+    delay_samples, delay_words = delay_of(model, measurement, arguments)
     found: dict[str, Any] = {
         "natural_frequency_hz": model.natural_frequency / (2.0 * np.pi),
         "damping_ratio": model.damping_ratio,
-        "delay_samples": delay_of(model, arguments),
+        "delay": model.delay,
+        "delay_samples": delay_samples,
         "denominator": model.denominator,
         "gain": model.gain,
     }
@@ -258,11 +261,12 @@ def finish_dynamics(
         groups = {
             "dynamics": {"denominator": model.denominator},
             "modes": modes,
-            "sensor": {"delay_samples": found["delay_samples"]},
+            "sensor": {"delay_samples": delay_samples},
         }
         found.update({f"modes.{key}": value for key, value in modes.items() if value})
-        if model.bandwidth_hz:
+        if static:  # a lag was looked for; 0 takes the place of one that was found before
             groups["amplifier"] = {"bandwidth_hz": model.bandwidth_hz}
+        if model.bandwidth_hz:
             found["amplifier.bandwidth_hz"] = model.bandwidth_hz
     else:
         groups = {"dynamics": {"elastic_constant": found.pop("gain")}}
@@ -270,7 +274,7 @@ def finish_dynamics(
         found.update(groups["dynamics"])
     for line in lines(found, confidence):
         console.print(line, soft_wrap=True)
-    console.print(f"delay_samples: {found['delay_samples']}")
+    console.print(delay_words, soft_wrap=True)
     comment = said(
         name,
         f"identified from {arguments.recording}: rms {fit.rms_percent:.3f} % of the stroke",
@@ -290,9 +294,29 @@ def finish_dynamics(
     ]
 
 
-def delay_of(model: DynamicsModel, arguments: argparse.Namespace) -> int:
-    """Return the age of a reading (samples): what was found, and what a bag was read with."""
-    return model.delay_samples + is_bag(arguments.recording) * arguments.sensor_delay
+def delay_of(
+    model: DynamicsModel, measurement: Measurement, arguments: argparse.Namespace
+) -> tuple[int, str]:
+    """Return the age of a reading in samples of the loop, and how it comes about in words.
+
+    It is what was found, and what a bag was read with. The loop's sample time is that of the cantilever.yaml of
+    --out, where it has one: a recording may be sampled faster.
+    """
+    stored = arguments.out / "cantilever.yaml"
+    said = load(stored, "cantilever") if stored.exists() else {}
+    sample_time = said.get("sample_time", FeedbackParameters().sample_time)
+    row = measurement.sample_time
+    known = is_bag(arguments.recording) * arguments.sensor_delay
+    samples = replace(model, delay=model.delay + known * row).delay_samples(sample_time)
+    words = (
+        f"delay_samples: {samples}, of {sample_time * 1e6:g} µs in the loop; found are "
+        f"{model.delay * 1e6:.4g} µs, {model.delay / row:.3g} rows of {row * 1e6:.4g} µs"
+    )
+    if row > 1.01 * sample_time:
+        words += (
+            ". A recording that is sampled more slowly than the loop tells little about the delay"
+        )
+    return samples, words
 
 
 def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
@@ -435,7 +459,7 @@ def update(path: Path, name: str, comment: str, groups: Mapping[str, Mapping[str
         comments = [line[2:] for line in path.read_text().splitlines() if line.startswith("# ")]
         comments = [line for line in comments if not line.startswith(f"{name}: ")]
     for group, found in groups.items():
-        values.update({f"{group}.{entry}": value for entry, value in found.items()})
+        values.update({f"{group}.{entry}".lstrip("."): value for entry, value in found.items()})
     dump(path, path.stem, values, "\n".join([*comments, comment]))
     return path
 

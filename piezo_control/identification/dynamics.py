@@ -5,13 +5,14 @@ The model's output is compared, not its equation, so noise does not bias the dam
 
     deflection = sum_i gain_i D_i(s) z^-delay H(A(z) drive) + offset + slope t,    A(z) = (1 - r) / (1 - r z^-1)
 
-`drive` is held from sample to sample (exact zero-order hold). Natural frequencies, damping ratios and a delay of whole
-samples are searched, the rest is linear least squares. With the tip force as drive the gain is the elastic constant
+`drive` is held from sample to sample (exact zero-order hold). Natural frequencies, damping ratios and the delay are
+searched, the rest is linear least squares. A delay is of whole samples where the criterion below does not tell. With the tip force as drive the gain is the elastic constant
 s_p. A voltage goes through the hysteresis operator H, where that is known, and the gain should be 1; only then is
 the lag A of an amplifier searched, since hysteresis that is not known is a lag, too. Its output is held from sample to
 sample, as the simulated amplifier and the certificate have it: r = exp(-2 pi bandwidth h).
 
-A mode or the lag is added, whichever explains more, as long as the evidence is for it: G. Schwarz's criterion
+A mode or the lag is added, whichever explains more, as long as the evidence is for it, a mode with a share that
+its interval tells from none and well above the first, which has to vibrate, too: G. Schwarz's criterion
 n ln(sum of squares) + k ln n (Annals of Statistics 6 (1978) 461), k = 3 numbers per mode and 1 for the lag, n the
 samples over the memory of what is left, falls.
 """
@@ -35,12 +36,15 @@ from piezo_control.identification.fit import column_norms
 from piezo_control.identification.measurement import Measurement, MeasurementError
 
 FREQUENCIES = 150  # tried before the search, from one cycle in the measurement to Nyquist
-LONGEST_DELAY = 8  # samples
+DELAYS = (0.125, 0.25, 0.5, 1.0)  # periods of the first mode, from which the delay is searched
+WHOLE = 0.02  # samples: a delay so near to whole ones has them
+ROUNDED_DOWN = 0.2  # samples, by which a delay may be longer than it counts
 LARGEST_LEFT = 0.5  # of what was measured around the resonance
 STEP = 1e-6  # relative, of a derivative
 DAMPING_RATIOS = (0.005, 0.03, 0.2, 0.9)
 LIGHT_DAMPING = (0.005, 0.03, 0.2)  # of higher modes
 NUMBERS_PER_MODE = 3
+MOST_DELAYS = 8  # tried together with a lag
 BANDWIDTHS, COARSE_FREQUENCIES = (
     15,
     40,
@@ -68,7 +72,7 @@ class DynamicsModel:
     gain: float  # m per unit of the drive
     offset: float  # m
     slope: float  # m/s
-    delay_samples: int  # from the drive to the deflection, beyond how they are paired
+    delay: float  # s, from the drive to the deflection, beyond how they are paired
     modes: tuple[Mode, ...] = ()  # above the first
     bandwidth_hz: float = 0.0  # of the amplifier's lag; 0: none is seen
     confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
@@ -85,25 +89,43 @@ class DynamicsModel:
         time = np.asarray(time, float)
         sample_time = time[1] - time[0]
         rate = 2.0 * math.pi * self.bandwidth_hz * sample_time
-        held = _delayed(_behind(np.asarray(drive, float), rate, static), self.delay_samples)
+        held = _behind(np.asarray(drive, float), rate, static)
         first = 1.0 - sum(mode.share for mode in self.modes)
         modes = (Mode(self.natural_frequency, self.damping_ratio, first), *self.modes)
-        response = sum(m.share * _respond(m[0], m[1], held, sample_time) for m in modes)
+        late = self.delay / sample_time
+        response = sum(m.share * _respond(m[0], m[1], held, sample_time, late) for m in modes)
         return self.gain * response + self.offset + self.slope * (time - time[0])
+
+    def delay_samples(self, sample_time: float) -> int:
+        """Return the delay in samples of a loop, rounded up: a reading that is older than it counts is not expected."""
+        return max(0, math.ceil(self.delay / sample_time - ROUNDED_DOWN))
 
 
 def _denominator(frequency: float, damping: float) -> tuple[float, float, float]:
     return 1.0 / frequency**2, 2.0 * damping / frequency, 1.0
 
 
-def _respond(frequency: float, damping: float, drive: NDArray, sample_time: float) -> NDArray:
-    """Return D(s) drive at the ends of the intervals over which the drive is held, from rest."""
+def _respond(
+    frequency: float, damping: float, drive: NDArray, sample_time: float, delay: float
+) -> NDArray:
+    """Return D(s) drive, `delay` samples late, at the ends of the intervals over which the drive is held, from rest."""
     inertia, friction, stiffness = _denominator(frequency, damping)
     free = propagator(inertia, friction, stiffness, sample_time)
     towards = 1.0 - free.xx, -free.vx  # what a drive of 1 adds to position and speed
-    numerator = towards[0], free.xv * towards[1] - free.vv * towards[0]
+    position = towards[0], free.xv * towards[1] - free.vv * towards[0]
     denominator = 1.0, -free.xx - free.vv, free.xx * free.vv - free.xv * free.vx
-    return drive[0] + lfilter(numerator, denominator, drive - drive[0])
+    whole = math.floor(delay)
+    part = delay - whole
+    moved = _delayed(drive, whole) - drive[0]
+    response = lfilter(position, denominator, moved)
+    if part:
+        # The reading falls between two samples: from the one before, on with the drive of this interval.
+        speed = towards[1], free.vx * towards[0] - free.xx * towards[1]
+        velocity = _delayed(lfilter(speed, denominator, moved), 1)
+        short = propagator(inertia, friction, stiffness, (1.0 - part) * sample_time)
+        response = moved + short.xx * (_delayed(response, 1) - moved) + short.xv * velocity
+        response[0] = 0.0
+    return drive[0] + response
 
 
 def _behind(drive: NDArray, rate: float, static: Static | None) -> NDArray:
@@ -146,12 +168,13 @@ def identify_dynamics(
     if np.ptp(drive) == 0.0:
         raise MeasurementError(f"{measurement.source}: the drive is constant")
     problem = _Problem(measurement, drive, static)
-    # A delay looks like damping, so it is searched with the rest. Each search begins where the one
-    # with a sample less ended.
-    fits = [problem.refined(problem.begun(_Chain([], 0), DAMPING_RATIOS))]
-    for delay in range(1, LONGEST_DELAY + 1):
-        fits.append(problem.refined(fits[-1].chain._replace(delay=delay)))
-    best = min(fits, key=lambda fit: fit.squares)
+    # A delay looks like damping, so it is searched with the rest. Each search begins with the mode that the
+    # one before ended with.
+    fits = [problem.refined(problem.begun(_Chain([], 0.0), DAMPING_RATIOS))]
+    period = 2.0 * math.pi / fits[0].chain.modes[0][0] / measurement.sample_time
+    for share in DELAYS:
+        fits.append(problem.refined(fits[-1].chain._replace(delay=share * period)))
+    best = problem.whole(min(fits, key=lambda fit: fit.squares))
     if best.chain.modes[0][0] >= problem.nyquist:
         raise MeasurementError(
             f"{measurement.source}: no vibration below the Nyquist frequency of "
@@ -160,10 +183,11 @@ def identify_dynamics(
     while True:
         trials = []
         if len(best.chain.modes) < most_modes:
-            trials.append(problem.near(problem.begun(best.chain, LIGHT_DAMPING)))
+            trials.append(problem.begun(best.chain, LIGHT_DAMPING))
         if static and not best.chain.rate:
-            trials.append(problem.near(problem.lagging(best.chain)))
-        evident = [fit for fit in trials if problem.evidence(best, fit) > 0.0]
+            trials.append(problem.lagging(best.chain))
+        tried = [problem.whole(problem.refined(chain)) for chain in trials]
+        evident = [fit for fit in tried if problem.evidence(best, fit) > 0.0]
         if not evident:
             return problem.model(best.chain)
         fewer = best
@@ -174,18 +198,23 @@ class _Chain(NamedTuple):
     """What is searched: modes as pairs of natural frequency (rad/s) and damping ratio, delay and lag."""
 
     modes: list[tuple[float, float]]
-    delay: int  # samples
+    delay: float  # samples
     rate: float = 0.0  # of the amplifier's lag, per sample; 0: none
 
     @property
-    def numbers(self) -> NDArray[np.float64]:
-        """Those that are searched by their derivatives."""
-        return np.array([*(number for mode in self.modes for number in mode), self.rate])
+    def coordinates(self) -> NDArray[np.float64]:
+        """What is searched: logarithms of the modes' numbers, the delay, the logarithm of the lag's rate if there is one."""
+        lag = [math.log(self.rate)] if self.rate else []
+        return np.array(
+            [*(math.log(number) for mode in self.modes for number in mode), self.delay, *lag]
+        )
 
-    def moved(self, numbers: NDArray[np.float64]) -> _Chain:
-        """Return the chain with other numbers."""
-        *pairs, rate = numbers.tolist()
-        return self._replace(modes=list(zip(pairs[::2], pairs[1::2])), rate=rate)
+    def at(self, coordinates: NDArray[np.float64]) -> _Chain:
+        """Return the chain of its kind that has these coordinates."""
+        count = 2 * len(self.modes)
+        pairs = np.exp(coordinates[:count]).reshape(-1, 2).tolist()
+        rate = math.exp(coordinates[-1]) if self.rate else 0.0
+        return _Chain([(w, d) for w, d in pairs], float(coordinates[count]), rate)
 
 
 class _Fit(NamedTuple):
@@ -209,8 +238,8 @@ class _Problem:
 
     def regressors(self, chain: _Chain) -> NDArray:
         """Return the responses of the modes, 1 and the time."""
-        held = _delayed(self.behind(chain.rate), chain.delay)
-        responses = [_respond(w, d, held, self.sample_time) for w, d in chain.modes]
+        held = self.behind(chain.rate)
+        responses = [_respond(w, d, held, self.sample_time, chain.delay) for w, d in chain.modes]
         return np.column_stack((*responses, self.columns))
 
     def linear(self, chain: _Chain) -> tuple[NDArray, NDArray]:
@@ -234,7 +263,9 @@ class _Problem:
     def lagging(self, chain: _Chain) -> _Chain:
         """Return a chain with the best lag of a grid, which takes the place of some of the delay or the damping."""
         rates = np.geomspace(self.lowest * self.sample_time, math.pi, BANDWIDTHS).tolist()
-        delays = range(chain.delay + 1)
+        delays = np.linspace(
+            0.0, chain.delay, min(math.ceil(chain.delay), MOST_DELAYS) + 1
+        ).tolist()
         modes = [chain.modes]
         if len(chain.modes) == 1:  # without the lag, even the natural frequency may be another one
             grid = np.geomspace(self.lowest, 0.98 * self.nyquist, COARSE_FREQUENCIES).tolist()
@@ -243,34 +274,41 @@ class _Problem:
             [_Chain(pairs, d, rate) for pairs in modes for d in delays for rate in rates]
         )
 
-    def near(self, chain: _Chain) -> _Fit:
-        """Return the best fit near a chain, whose delay may be a sample off."""
-        delays = range(max(chain.delay - 1, 0), chain.delay + 2)
-        fits = [self.refined(chain._replace(delay=delay)) for delay in delays]
-        return min(fits, key=lambda fit: fit.squares)
+    def whole(self, fit: _Fit) -> _Fit:
+        """Return the fit with a delay of whole samples, unless the evidence is for the part of one."""
+        delay = fit.chain.delay
+        fits = [
+            self.refined(fit.chain._replace(delay=float(n)), moves_delay=False)
+            for n in (math.floor(delay), math.ceil(delay))
+        ]
+        best = min(fits, key=lambda fit: fit.squares)
+        is_whole = abs(best.chain.delay - delay) < WHOLE
+        return best if is_whole or self.evidence(best, fit) <= 0.0 else fit
 
-    def refined(self, chain: _Chain) -> _Fit:
-        """Return the best fit near a chain with its delay."""
+    def refined(self, chain: _Chain, moves_delay: bool = True) -> _Fit:
+        """Return the best fit near a chain."""
         spread = float(np.std(self.deflection))
         count = len(chain.modes)
-        searched = np.append(np.ones(2 * count, bool), chain.rate > 0.0)
+        searched = np.ones(chain.coordinates.size, bool)
+        searched[2 * count] = moves_delay
 
-        def there(logs: NDArray) -> _Chain:
-            numbers = np.zeros(searched.size)
-            numbers[searched] = np.exp(logs)
-            return chain.moved(numbers)
+        def there(found: NDArray) -> _Chain:
+            coordinates = chain.coordinates
+            coordinates[searched] = found
+            return chain.at(coordinates)
 
-        low, high = np.log(
-            [
-                (*(0.1 * self.lowest, 1e-6) * count, 0.1 * self.lowest * self.sample_time),
-                (*(10.0 * self.nyquist, 1e2) * count, 10.0),
-            ]
+        low = np.log(
+            (*(0.1 * self.lowest, 1e-6) * count, 1.0, 0.1 * self.lowest * self.sample_time)
         )
+        high = np.log((*(10.0 * self.nyquist, 1e2) * count, 1.0, 10.0))
+        high[2 * count] = 0.5 * self.deflection.size
+        scale = np.array((*(1e-3, 1e-1) * count, 1e-1, 1e-1))
+        low, high, scale = (values[: searched.size][searched] for values in (low, high, scale))
         found = least_squares(
-            lambda logs: self.linear(there(logs))[1] / spread,
-            np.log(chain.numbers[searched]),
-            bounds=(low[searched], high[searched]),
-            x_scale=np.array((*(1e-3, 1e-1) * count, 1e-1))[searched],
+            lambda coordinates: self.linear(there(coordinates))[1] / spread,
+            chain.coordinates[searched],
+            bounds=(low, high),
+            x_scale=scale,
         )
         refined = there(found.x)
         return _Fit(refined._replace(modes=sorted(refined.modes)), 2.0 * found.cost * spread**2)
@@ -280,43 +318,55 @@ class _Problem:
         left = self.linear(more.chain)[1]
         samples = left.size / memory(left)
         gained = samples * math.log(fewer.squares / more.squares) if more.squares > 0.0 else 0.0
-        first = more.chain.modes[0][0] / fewer.chain.modes[0][0]
-        higher = all(d < 1.0 and w < self.nyquist for w, d in more.chain.modes[1:])
         modes = len(more.chain.modes) - len(fewer.chain.modes)
-        another = modes and not 1.0 / HIGHER < first < HIGHER
-        if not higher or another or more.chain.rate > math.pi:
+        if more.chain.rate > math.pi or modes and not self.are_modes(fewer.chain, more.chain):
             return 0.0
         lags = bool(more.chain.rate) - bool(fewer.chain.rate)
-        return gained - (NUMBERS_PER_MODE * modes + lags) * math.log(samples)
+        parts = bool(more.chain.delay % 1.0) - bool(fewer.chain.delay % 1.0)
+        return gained - (NUMBERS_PER_MODE * modes + lags + parts) * math.log(samples)
+
+    def are_modes(self, fewer: _Chain, more: _Chain) -> bool:
+        """Say whether the modes of `more` are vibrations, the first that of `fewer`, the others above and not nothing."""
+        first, *others = more.modes
+        if not 1.0 / HIGHER < first[0] / fewer.modes[0][0] < HIGHER:
+            return False
+        if not all(d < 1.0 for _, d in more.modes):
+            return False
+        if not all(HIGHER * first[0] < w < self.nyquist for w, _ in others):
+            return False
+        model = self.model(more)
+        half_widths = model.confidence["modes.share"]
+        assert isinstance(half_widths, tuple)
+        return all(abs(m.share) > half for m, half in zip(model.modes, half_widths))
 
     def model(self, chain: _Chain) -> DynamicsModel:
         """Return the model with its intervals."""
         x, residual = self.linear(chain)
         here = self.regressors(chain)
-        searched = chain.numbers
-        moved = []
-        for i, value in enumerate(searched):
-            after = searched * np.where(np.arange(searched.size) == i, 1.0 + STEP, 1.0)
-            change = self.regressors(chain.moved(after)) - here
-            moved.append(change @ x / (STEP * (value or 1.0)))
+        searched = chain.coordinates
+        steps = STEP * np.eye(searched.size)
+        moved = [(self.regressors(chain.at(searched + step)) - here) @ x / STEP for step in steps]
         count = len(chain.modes)
+        if not chain.delay % 1.0:  # a whole number is known
+            moved[2 * count] = np.zeros_like(residual)
 
         def values(numbers: NDArray) -> Values:
-            modes, rate = numbers[: 2 * count].reshape(-1, 2), numbers[2 * count]
-            gains = numbers[2 * count + 1 :][:count]
-            (frequency, damping), higher = modes[0], modes[1:]
+            there = chain.at(numbers[: searched.size])
+            gains = numbers[searched.size :][:count]
+            (frequency, damping), higher = there.modes[0], np.array(there.modes[1:])
             found: dict[str, float | tuple[float, ...]] = {
                 "natural_frequency_hz": frequency / (2.0 * math.pi),
                 "damping_ratio": damping,
                 "denominator": _denominator(frequency, damping),
                 "gain": gains.sum(),
+                "delay": there.delay * self.sample_time,
             }
             if count > 1:
                 found["modes.frequency_hz"] = tuple(higher[:, 0] / (2.0 * math.pi))
                 found["modes.damping"] = tuple(higher[:, 1])
                 found["modes.share"] = tuple(gains[1:] / gains.sum())
             if chain.rate:
-                found["amplifier.bandwidth_hz"] = rate / (2.0 * math.pi * self.sample_time)
+                found["amplifier.bandwidth_hz"] = there.rate / (2.0 * math.pi * self.sample_time)
             return found
 
         fitted = np.concatenate((searched, x))
@@ -326,9 +376,8 @@ class _Problem:
         first, *others = chain.modes
         higher = tuple(Mode(w, d, g / gain) for (w, d), g in zip(others, gains[1:]))
         bandwidth_hz = chain.rate / (2.0 * math.pi * self.sample_time)
-        return DynamicsModel(
-            *first, gain, offset, slope, chain.delay, higher, bandwidth_hz, confidence
-        )
+        late = chain.delay * self.sample_time
+        return DynamicsModel(*first, gain, offset, slope, late, higher, bandwidth_hz, confidence)
 
 
 def need_vibration(

@@ -261,7 +261,7 @@ def commission(
     fit = quality(swept.deflection, model.deflection(swept.time, swept.voltage), static)
     console.print(
         f"resonance {model.natural_frequency / (2.0 * math.pi):.1f} Hz, damping ratio "
-        f"{model.damping_ratio:.4f}, delay {model.delay_samples} samples (rms {fit.rms_percent:.1f} %)"
+        f"{model.damping_ratio:.4f}, delay {model.delay_samples(a.sample_time)} samples (rms {fit.rms_percent:.1f} %)"
     )
     need("one resonance and a delay", {"sweep": fit}, "a finger without vibration")
     if not agree(f"decaying sine over the whole range, {low:g} to {high:g} V?"):
@@ -283,9 +283,10 @@ def commission(
     # Once more, behind the hysteresis, whose width is no damping any more; now an amplifier's lag can be told from it.
     operator = partial(deflection_history, hysteresis.parameters)
     model = identify_dynamics(swept, swept.voltage, static=operator)
+    delay = model.delay_samples(a.sample_time)
     lag = f"{model.bandwidth_hz:.4g} Hz" if model.bandwidth_hz else "faster than is seen"
     console.print(
-        f"behind the hysteresis: damping ratio {model.damping_ratio:.4f}, delay {model.delay_samples} samples, "
+        f"behind the hysteresis: damping ratio {model.damping_ratio:.4f}, delay {delay} samples, "
         f"amplifier {lag}"
     )
     # What was called zero is the finger at rest; the model's zero is a homed finger at 0 V.
@@ -300,7 +301,7 @@ def commission(
         **plays,
         "sample_time": a.sample_time,
         "dynamics.denominator": model.denominator,
-        "sensor.delay_samples": model.delay_samples,
+        "sensor.delay_samples": delay,
         "sensor.noise": rest.noise,
         "amplifier.bandwidth_hz": model.bandwidth_hz,
         **{f"amplifier.{name}": value for name, value in limits.items()},
@@ -331,7 +332,7 @@ def commission(
         "driver": a.driver,
         "driver_options": a.driver_options,
         "write": a.write,
-        "delay_samples": model.delay_samples - (a.write == "next_edge"),
+        "delay_samples": delay - (a.write == "next_edge"),
         "sensor_scale": bench.scale,
         "sensor_zero": bench.zero,
         "sensor_low": float(reached.min()) - 0.25 * stroke,

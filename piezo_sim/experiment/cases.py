@@ -237,7 +237,7 @@ def read_experiment(name: str, overrides: Mapping[str, Any]) -> tuple[str, list[
     Raises ParameterError naming file, run and key.
     """
     if "params" in overrides:
-        _need_parameters(overrides["params"])
+        need_parameters(overrides["params"])
     title, runs = _runs(name)
     _need_effect(overrides, [run for _, run, _ in runs])
     cases = [
@@ -290,7 +290,7 @@ def _need_effect(overrides: Mapping[str, Any], runs: Iterable[Mapping[str, Any]]
             )
 
 
-def _need_parameters(folder: Path) -> None:
+def need_parameters(folder: Path) -> None:
     """Refuse a folder that has nothing to replace anything with."""
     if not folder.is_dir():
         raise ParameterError(f"params: {folder} is no folder")

@@ -20,13 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from piezo_control.feedback import FeedbackParameters, read_controller
-from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.feedback import FeedbackParameters, read_controller, uncovered
+from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.metrics import StepMetrics, step_metrics
-from piezo_control.parameters import ParameterError
+from piezo_control.parameters import ParameterError, build
 from piezo_control.profile import Profile
 from piezo_control.thermal import REFERENCE_DEGC
 from piezo_sim.engine import Deviations, run_deviating
+from piezo_sim.experiment.cases import need_parameters, own_parameters
 from piezo_sim.plant.cantilever import CantileverParameters
 
 CHUNK = 500
@@ -56,6 +57,19 @@ class Study:
         for name in FACTORS:
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ParameterError(f"'{name}' is {getattr(self, name)}, must be in [0, 1)")
+        finger, controller = self.plant, self.feedback
+        for name, here, there in (
+            ("sample_time", finger.sample_time, controller.sample_time),
+            ("delay_samples", finger.sensor.delay_samples, controller.delay_samples),
+        ):
+            if here != there:
+                raise ParameterError(f"'{name}' of the controller is {there}, of the finger {here}")
+        low, high = Feedforward(self.feedforward, finger.sample_time).reachable_range
+        if not low <= self.step <= high:
+            raise ParameterError(
+                f"'step' is {self.step * 1e6:g} µm, must be in the finger's reach of {low * 1e6:.4g} to "
+                f"{high * 1e6:.4g} µm"
+            )
 
     def factors(self, chunk: int) -> np.ndarray:
         """Return the factors on resonance, damping and stroke of a chunk, shape (CHUNK, 3)."""
@@ -135,6 +149,7 @@ def monte_carlo(
         ("draws", 1, 10**8, draws),
         ("workers", 1, 10**4, workers),
         ("seed", 0, 2**63 - 1, study.seed),
+        ("samples", 2, 10**6, study.samples),
     ):
         if value is not None and not least <= value <= most:
             raise ParameterError(f"'{name}' is {value}, must be in [{least}, {most}]")
@@ -172,6 +187,14 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--draws", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument(
+        "--params", type=Path, metavar="DIR",
+        help="folder whose cantilever.yaml and feedforward.yaml are the finger, as of `identify`",
+    )  # fmt: skip
+    parser.add_argument("--step", type=float, default=Study.step, help="of the reference, in m")
+    parser.add_argument(
+        "--samples", type=int, default=Study.samples, help="length of each response"
+    )
     parser.add_argument("--workers", type=int, help="processes; default: one per core")
     parser.add_argument(
         "--scheduler", metavar="ADDRESS", help="run on the workers of this dask scheduler instead"
@@ -184,7 +207,22 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         feedback = read_controller(given.controller)
         widths = {name: getattr(given, name) for name in FACTORS}
-        study = Study(feedback=feedback, seed=given.seed, **widths)
+        if given.params:
+            need_parameters(given.params)
+        study = Study(
+            plant=build(CantileverParameters, own_parameters(given.params, "cantilever")),
+            feedforward=build(FeedforwardParameters, own_parameters(given.params, "feedforward")),
+            feedback=feedback,
+            step=given.step,
+            samples=given.samples,
+            seed=given.seed,
+            **widths,
+        )
+        reach = Feedforward(study.feedforward, study.plant.sample_time).reachable_range
+        for words in uncovered(
+            feedback, study.plant.sensor.delay_samples, study.plant.dynamics.denominator, reach
+        ):
+            print(f"monte_carlo: controller '{given.controller}': {words}", file=sys.stderr)
         result = monte_carlo(
             study, given.draws, given.out, _show_progress, given.workers, given.scheduler
         )
