@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gain and offset of the models follow a sensor, slowly and within bounds, until it is taken away."""
+"""Gain, offset and resonance of the models follow a sensor, slowly and within bounds, until it is taken away."""
 
 import math
 from dataclasses import replace
@@ -103,3 +103,56 @@ def test_it_is_the_same_law_compiled_and_called_one_by_one():
         else:
             voltage = law.step(run.reference[k], 22.0)
         assert voltage == run.voltage[k]
+
+
+A2, A1, _ = DENOMINATOR
+STEPS = Profile(
+    0.05 * np.arange(82), 10e-6 * (np.arange(82) % 2), linear=False
+)  # every 50 ms, 4 s and one more
+
+
+def shaken(resonance, parameters, damping=1.0):
+    """Amplitude (of the step) that is left after a step without the sensor, and the ratio that was adapted until then."""
+    denominator = (A2 / resonance**2, A1 * damping / resonance, 1.0)
+    plant = CantileverParameters(dynamics=DynamicsParameters(denominator=denominator))
+    led = 40_200  # in the middle between two steps
+    run, state = engine.run_led(
+        plant, read_controller("robust"), SensorlessParameters(adaptation=parameters), TemperatureParameters(),
+        STEPS, led, led + 800,
+    )  # fmt: skip
+    after = led + 300 + 30  # 3 ms behind the step
+    return 0.5 * np.ptp(run.true_deflection[after : after + 40]) / 10e-6, state.adapted.ratio[0]
+
+
+@pytest.mark.parametrize("resonance", [0.84, 0.92, 1.0, 1.08, 1.16])
+def test_the_resonance_is_found_while_the_finger_is_led(resonance):
+    """What the shaper then leaves is what it leaves of the nominal finger, 2 %: its taps come in the mode's time."""
+    left, ratio = shaken(resonance, replace(ON, time_constant=1.0))
+    assert ratio == pytest.approx(resonance, abs=0.004)
+    assert left < 0.025
+
+
+def test_without_adaptation_the_shaper_leaves_more_of_a_finger_outside_its_box():
+    left, ratio = shaken(0.84, AdaptationParameters())
+    assert ratio == 1.0
+    assert left > 0.06
+
+
+def test_damping_is_not_taken_for_resonance_and_the_range_holds():
+    assert shaken(1.1, replace(ON, time_constant=1.0), damping=2.0)[1] == pytest.approx(
+        1.1, abs=0.01
+    )
+    bounded = replace(ON, time_constant=1.0, resonance_range=0.05)
+    assert 1.049 < shaken(1.16, bounded)[1] <= 1.05
+    assert shaken(1.16, replace(bounded, resonance_range=0.0))[1] == 1.0
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.floats(-1e-3, 1e-3), st.floats(-1e-3, 1e-3)), max_size=50))
+def test_no_reading_leads_the_resonance_out_of_its_range(readings):
+    a = adaptation.discretize(replace(ON, time_constant=1e-6), DENOMINATOR, H)
+    state = unadapted(a, 0.0)
+    for actuated, deflection in readings:
+        remember(a, state, actuated, 0.0)
+        adapt(a, state, deflection)
+        assert abs(state.ratio[0] - 1.0) <= ON.resonance_range + 1e-15

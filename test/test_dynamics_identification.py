@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import step as step_response
 
 from piezo_control.dynamics import ModesParameters
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
@@ -206,3 +207,55 @@ def test_creep_is_taken_for_no_mode():
     model = identify_dynamics(replace(measurement, deflection=crept), measurement.voltage, 5)
     assert model.modes == ()
     assert model.natural_frequency == pytest.approx(FREQUENCY, rel=1e-3)
+
+
+def rung(sample_time, delay, sensor_hz=0.0, duration=0.1):
+    """A step of 20 V at 2 ms of a finger with 700 Hz, damping ratio 0.02, 0.5 µm/V, through a late sensor; 5 nm noise.
+
+    By scipy's step response in continuous time: a row's drive was held until its deflection, so the step's row
+    is a sample after the step.
+    """
+    time = np.arange(0.0, duration, sample_time)
+    omega = 2.0 * np.pi * 700.0
+    system = [1.0], [omega**-2, 0.04 / omega, 1.0]
+    if sensor_hz:
+        system = [1.0], np.polymul(system[1], [1.0 / (2.0 * np.pi * sensor_hz), 1.0])
+    begin = 2e-3
+    after = time - begin - delay
+    fine = np.linspace(0.0, duration, 100_001)
+    deflection = np.interp(after, *step_response(system, T=fine), left=0.0) * 10e-6
+    deflection += np.random.default_rng(4).normal(0.0, 5e-9, time.size)
+    voltage = np.where(time > begin + 0.5 * sample_time, 20.0, 0.0)
+    return Measurement("rung", time, voltage, deflection, None, None, np.arange(time.size))
+
+
+@pytest.mark.parametrize(
+    "sample_time, delay",
+    [
+        (1e-4, 25e-6),
+        (1e-4, 137.5e-6),
+        (1e-4, 262.5e-6),
+        (2e-5, 100e-6),
+        (5e-6, 100e-6),
+        (5e-6, 47e-6),
+    ],
+)
+def test_a_delay_between_samples_and_one_of_many_is_found_and_makes_no_modes(sample_time, delay):
+    measurement = rung(sample_time, delay, duration=0.05)
+    model = identify_dynamics(measurement, measurement.voltage, most_modes=3)
+    assert model.modes == ()
+    assert model.delay == pytest.approx(delay, abs=2e-7)
+    assert model.natural_frequency == pytest.approx(2.0 * np.pi * 700.0, rel=1e-4)
+    assert model.damping_ratio == pytest.approx(0.02, rel=2e-3)
+    assert model.delay_samples(1e-4) == math.ceil(delay / 1e-4 - 0.2)
+
+
+def test_a_filter_in_the_sensor_makes_no_modes():
+    measurement = rung(1e-4, 0.0, sensor_hz=2e3)
+    model = identify_dynamics(measurement, measurement.voltage, most_modes=3)
+    assert model.modes == ()
+    assert model.delay == pytest.approx(
+        1.0 / (2.0 * np.pi * 2e3), rel=0.1
+    )  # of a lag, at low frequencies
+    assert model.natural_frequency == pytest.approx(2.0 * np.pi * 700.0, rel=1e-3)
+    assert model.damping_ratio == pytest.approx(0.02, rel=0.1)

@@ -22,11 +22,12 @@ from piezo_control.nodes.parameters import (
     ServoNodeParameters,
     read_feedforward,
 )
-from piezo_control.parameters import build, load
+from piezo_control.parameters import build, dump, load
 from piezo_control.profile import Profile
 from piezo_control.recording.writer import write_recording
 from piezo_sim.engine import drive, run
 from piezo_sim.experiment import cli as experiment
+from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
@@ -372,3 +373,53 @@ def test_nothing_is_replaced_unasked_and_no_bad_fit_is_written(identify, tmp_pat
     assert identify("hysteresis", good, *words) == 2
     assert "--overwrite" in capsys.readouterr().err and path.read_text() == before
     assert identify("hysteresis", good, *words, "--overwrite") == 0
+
+
+def test_what_others_wrote_into_a_file_stays_and_what_is_not_found_again_goes(identify, tmp_path):
+    """Limits of an actuator of one polarity, the dynamics; a lag that a second recording does not show."""
+    slow = CantileverParameters(amplifier=AmplifierParameters(bandwidth_hz=1000.0))
+    bag = recorded(
+        tmp_path / "excite",
+        CantileverParameters(sample_time=1e-3),
+        decaying_sine(40.0, cycles=6),
+        6.0,
+    )
+    step = Profile([0.0, 0.01], [0.0, 30.0])
+    lagging = recorded(tmp_path / "lagging", slow, step, 0.08)
+    quick = recorded(tmp_path / "quick", CantileverParameters(), step, 0.08)
+    out = tmp_path / "identified"
+    assert identify("hysteresis", bag) == 0
+    assert identify("dynamics", lagging) == 0
+    found = load(out / "cantilever.yaml", "cantilever")
+    assert found["amplifier.bandwidth_hz"] == pytest.approx(1000.0, rel=0.02)
+    stands = load(out / "feedforward.yaml", "feedforward") | {
+        "voltage_low": -30.0,
+        "voltage_high": 120.0,
+    }
+    dump(out / "feedforward.yaml", "feedforward", stands, "mine")
+    assert identify("dynamics", quick) == 0
+    assert load(out / "cantilever.yaml", "cantilever")["amplifier.bandwidth_hz"] == 0.0
+    assert identify("hysteresis", bag, "--overwrite") == 0
+    after = load(out / "feedforward.yaml", "feedforward")
+    assert (after["voltage_low"], after["voltage_high"]) == (-30.0, 120.0)
+    assert "dynamics.denominator" in after
+    assert "# mine" in (out / "feedforward.yaml").read_text()
+
+
+def test_a_delay_is_written_in_samples_of_the_loop(identify, tmp_path, capsys):
+    """100 µs, of which a recording at 50 kHz has five rows: one sample of the loop at 10 kHz, five of one at 50."""
+    time = np.arange(2500) * 2e-5
+    voltage = np.where(time < 2e-3, 0.0, 20.0)
+    model = DynamicsModel(2.0 * np.pi * 700.0, 0.02, 0.5, 0.0, 0.0, 1e-4)  # µm per V
+    table = np.column_stack((time, voltage, model.deflection(time, voltage)))
+    path = tmp_path / "fast.csv"
+    np.savetxt(
+        path, table, delimiter=",", header="time (s),voltage (V),deflection (um)", comments=""
+    )
+    assert identify("dynamics", path) == 0
+    out = tmp_path / "identified" / "cantilever.yaml"
+    assert load(out, "cantilever")["sensor.delay_samples"] == 1
+    assert "found are 100 µs, 5 rows of 20 µs" in capsys.readouterr().out.replace("\n", " ")
+    dump(out, "cantilever", {"sample_time": 2e-5}, "a faster loop")
+    assert identify("dynamics", path) == 0
+    assert load(out, "cantilever")["sensor.delay_samples"] == 5

@@ -13,7 +13,7 @@ import pytest
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import step_metrics
-from piezo_control.parameters import ParameterError, build, load
+from piezo_control.parameters import ParameterError, build, dump, load
 from piezo_control.profile import Profile
 from piezo_sim import engine
 from piezo_sim.engine import Deviations
@@ -179,3 +179,37 @@ def test_command_line_prints_the_figures(tmp_path, capsys):
     assert "none.yaml' is no file, and not one of the known" in capsys.readouterr().err
     assert monte_carlo.main(["paper", "--out", str(tmp_path), "--workers", "0"]) == 2
     assert "'workers' is 0, must be in [1, 10000]" in capsys.readouterr().err
+
+
+def test_a_controller_for_another_loop_and_a_step_out_of_reach_are_refused(tmp_path, capsys):
+    for change, words in (
+        ({"sample_time": 2e-5}, "'sample_time' of the controller is 2e-05, of the finger 0.0001"),
+        ({"delay_samples": 3}, "'delay_samples' of the controller is 3, of the finger 1"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            Study(feedback=replace(PAPER, **change))
+    assert monte_carlo.main(["robust", "--step", "30e-6", "--out", str(tmp_path)]) == 2
+    assert (
+        "'step' is 30 µm, must be in the finger's reach of -22 to 22 µm" in capsys.readouterr().err
+    )
+
+
+def test_the_finger_of_a_folder_is_drawn_around(tmp_path, capsys):
+    """Half the weights: half the reach, and so the controller's certificate does not cover it, which is said."""
+    weights = tuple(0.5 * w for w in CantileverParameters().hysteresis.weights)
+    for node in ("cantilever", "feedforward"):
+        dump(tmp_path / f"{node}.yaml", node, {"hysteresis.weights": weights})
+    command = [
+        "robust",
+        "--params",
+        str(tmp_path),
+        "--draws",
+        "10",
+        "--workers",
+        "1",
+        "--samples",
+        "200",
+    ]
+    assert monte_carlo.main([*command, "--step", "5e-6", "--out", str(tmp_path / "a")]) == 0
+    assert "leave the finger's reach of -11 to 11 µm" in capsys.readouterr().err
+    assert monte_carlo.main([*command, "--out", str(tmp_path / "b")]) == 2

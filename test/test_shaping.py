@@ -95,3 +95,16 @@ def test_what_cannot_be_shaped_is_refused(monkeypatch):
     monkeypatch.setattr(shaping, "LONGEST", 10)
     with pytest.raises(ParameterError, match="'residual' is 0.04: no shaper up to 10 samples"):
         shaper(ShapingParameters(residual=0.04), DENOMINATOR, H)
+
+
+@pytest.mark.parametrize("ratio", [0.8, 0.93, 1.0, 1.07, 1.2])
+def test_taps_in_the_time_of_another_mode_leave_as_little_of_it(ratio):
+    """The bound of the box, 5 %; and the delay that whoever plans is told."""
+    taps = shaper(ShapingParameters(), DENOMINATOR, H)
+    impulse = [0.0] * longest(taps, ratio)
+    seen = [shape(taps, impulse, float(k == 0), ratio) for k in range(len(impulse) + 1)]
+    assert sum(seen) == pytest.approx(1.0, abs=1e-12)
+    assert min(seen) >= 0.0 and seen[-1] == 0.0
+    frequency = ratio / (2.0 * np.pi * np.sqrt(A2))
+    assert residual_vibration(seen, frequency, 0.5 * A1 / np.sqrt(A2), H) < 0.05
+    assert H * np.dot(seen, np.arange(len(seen))) == pytest.approx(delay(taps, H, ratio), rel=1e-9)
