@@ -14,6 +14,7 @@ import pytest
 import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
+from fault_bench import Network, may_make_networks
 from lifecycle_msgs.msg import Transition
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -27,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
+from piezo_control.nodes.network import Networks
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE, SETPOINT
 from piezo_control.start import Stop
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
@@ -146,6 +148,32 @@ def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
         neighbour.wait(lambda: reset(neighbour, "feedforward").success)
         neighbour.wait(lambda: voltages[-1].value > 25.0)
         assert stream
+
+
+def test_nonsense_of_a_second_publisher_is_told_with_who_publishes(neighbour, tmp_path):
+    """It may come before the match of its publisher is told; the first one is still silent."""
+    with node("cantilever", tmp_path, reply_timeout=600.0):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        deflections = neighbour.listen(Sample, "deflection")
+        first, second = neighbour.publisher("voltage"), neighbour.publisher("voltage")
+        neighbour.wait(lambda: deflections and states)
+        neighbour.insist(second, sample(0, 1e6), lambda: states[-1].phase == FingerState.FAULT)
+        assert "'/voltage' has 2 publishers: " in states[-1].text
+        assert first
+
+
+@pytest.mark.skipif(not may_make_networks(), reason="no rights to make networks")
+def test_a_network_that_comes_up_after_a_node_is_named(monkeypatch):
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    networks = Networks()
+    assert networks.missed() == ""
+    with Network() as network:
+        assert f"'{network.link}'" in networks.missed()
+        assert Networks().missed() == ""
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        assert networks.missed() == ""
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE")
+    assert networks.missed() == ""
 
 
 @pytest.mark.shows("a fault of a block")
