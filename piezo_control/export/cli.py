@@ -65,7 +65,7 @@ def make(arguments: argparse.Namespace) -> dict[str, str]:
             f"{controller.sample_time:g} s"
         )
     check_delay(controller, p)
-    found = objections(controller, feedforward)
+    found = objections(controller, feedforward, feedforward.dynamics.denominator)
     if found and not arguments.force:
         raise ParameterError(
             f"controller '{controller.name}' ({p.controller_file}): {'; '.join(found)}; "

@@ -113,8 +113,11 @@ class ServoNode(FingerNode):
 
     def _object(self, controller: FeedbackParameters) -> None:
         """Say what the certificate of a controller that is to run does not cover."""
+        finger = self._feedforward
         self._objections = (
-            [] if self.parameters.force_control else objections(controller, self._feedforward)
+            []
+            if self.parameters.force_control
+            else objections(controller, finger, finger.dynamics.denominator)
         )
         for objection in self._objections:
             self.get_logger().warning(

@@ -296,11 +296,12 @@ def commission(
     origin = f"Commissioned on driver '{a.driver}' ({a.driver_options or 'no options'})."
     limits = vars(bench.limits)
     plays = {f"hysteresis.{n}": v for n, v in flatten(hysteresis.parameters).items()}
-    dump(folder / "feedforward.yaml", "feedforward", {**limits, **plays}, origin)
+    vibration = {"dynamics.denominator": model.denominator}
+    dump(folder / "feedforward.yaml", "feedforward", {**limits, **plays, **vibration}, origin)
     finger = {
         **plays,
         "sample_time": a.sample_time,
-        "dynamics.denominator": model.denominator,
+        **vibration,
         "sensor.delay_samples": delay,
         "sensor.noise": rest.noise,
         "amplifier.bandwidth_hz": model.bandwidth_hz,

@@ -15,7 +15,7 @@ missed, a device that is gone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -295,10 +295,12 @@ def laws_of(
     )
 
 
-def objections(feedback: FeedbackParameters, feedforward: FeedforwardParameters) -> list[str]:
-    """Return what speaks against running the controller on this finger, in words; empty: nothing."""
+def objections(
+    feedback: FeedbackParameters, feedforward: FeedforwardParameters, denominator: Sequence[float]
+) -> list[str]:
+    """Return what speaks against running the controller on the finger with this D(s), in words; empty: nothing."""
     reach = Feedforward(feedforward, feedback.sample_time).reachable_range
-    return uncovered(feedback, feedback.delay_samples, feedback.denominator, reach)
+    return uncovered(feedback, feedback.delay_samples, denominator, reach)
 
 
 def watch_at_rest() -> Watch:
