@@ -153,10 +153,86 @@ def test_a_damaged_one_is_refused(tmp_path_factory, damage, k, separator):
         ("Voltage (V)", ("Voltage", "V")), ("x [µm]", ("x", "um")), ("disp_nm", ("disp", "nm")),
         ("U / V", ("U", "V")), ("Temp [C]", ("Temp", "degc")), ("V+ [V]", ("V+", "V")),
         ("U (Volts)", ("U", "V")), ("t [seconds]", ("t", "s")), ("plain", ("plain", "")), ("run_2", ("run_2", "")),
+        ("Time (msec)", ("Time", "ms")), ("Time_usec", ("Time", "us")), ("t [µsec]", ("t", "us")),
+        ("voltage (mv)", ("voltage", "mV")), ("U [kv]", ("U", "kV")), ("time in ms", ("time", "ms")),
+        ("Temp C", ("Temp C", "")), ("Torque [Nm]", ("Torque [Nm]", "")), ("V_in", ("V_in", "")),
     ],
 )  # fmt: skip
 def test_names_give_their_units(header, expected):
     assert split_name(header) == expected
+
+
+HEADINGS = ("time (s)", "voltage (V)", "deflection (um)")
+
+
+def write_table(path, headings=HEADINGS, time=lambda k: f"{0.1 * k:.1f}", rows=60):
+    """Write 60 rows 0.1 s apart, voltages of up to 6 V, deflections of 2 µm each further than the one before."""
+    lines = [",".join(headings), *(f"{time(k)},{k % 7},{2 * k}" for k in range(rows))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("place", "heading", "unit"),
+    [
+        (0, "time (jiffies)", "jiffies"), (0, "time_ns", "ns"), (0, "time [MS]", "MS"), (1, "voltage (counts)", "counts"),
+        (1, "voltage_uV", "uV"), (2, "deflection / inch", "inch"), (2, "deflection [Nm]", "Nm"),
+        (2, "deflection mils", "mils"),
+    ],
+)  # fmt: skip
+def test_a_unit_that_is_not_understood_is_refused_until_it_is_said(tmp_path, place, heading, unit):
+    headings = [*HEADINGS[:place], heading, *HEADINGS[place + 1 :]]
+    path = write_table(tmp_path / "a.csv", headings)
+    quantity = ("time", "voltage", "deflection")[place]
+    words = f"is in {unit}, '{quantity}' must be in one of .*as in --{quantity} {place}:"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(path, {quantity: str(place)})
+    said = read_measurement(path, {quantity: f"{place}:{('ms', 'mV', 'nm')[place]}"})
+    assert f"{quantity} = column '{heading}' [{('ms', 'mV', 'nm')[place]}]" in said.description
+    below = tmp_path / "below.csv"
+    units = ["s", "V", "um"]
+    units[place] = unit
+    write_table(below, ["time,voltage,deflection\n" + units[0], *units[1:]])
+    with pytest.raises(MeasurementError, match=f"is in {unit}, '{quantity}' must be in one of"):
+        read_measurement(below)
+
+
+def of_clock(step, form):
+    """Return times that are `step` seconds apart in a form of hours, minutes and seconds."""
+    return lambda k: form.format(h=k * step // 3600, m=k * step // 60 % 60, s=k * step % 60)
+
+
+@pytest.mark.parametrize(
+    ("heading", "column", "form", "step", "taken"),
+    [
+        ("time", None, "{h}:{m:02}:{s:02}", 1, "h:min:s"),
+        ("time", None, "{h}:{m:02}:{s:02}", 600, "h:min:s"),  # beyond 24 h
+        ("time", None, "{m:02}:{s:02}.0", 1, "min:s"),
+        ("time", None, "{m:02}:{s:02}", 30, "min:s"),  # up to minute 29, no hour
+        ("time", "0:min", "{m:02}:{s:02}", 1, "min:s"),
+        ("time [mm:ss]", None, "{m:02}:{s:02}", 1, "min:s"),
+        ("time", "time:h", "{h:02}:{m:02}", 60, "h:min"),
+        ("time (hh:mm)", None, "{h:02}:{m:02}", 60, "h:min"),
+        ("time (UTC)", "0", "2024-05-01 {h:02}:{m:02}", 60, "date"),
+    ],
+)
+def test_clocks_are_read_by_their_parts(tmp_path, heading, column, form, step, taken):
+    path = write_table(tmp_path / "a.csv", (heading, *HEADINGS[1:]), of_clock(step, form))
+    found = read_measurement(path, {"time": column} if column else {})
+    np.testing.assert_allclose(found.time, step * np.arange(60.0))
+    assert f"time = column '{heading}' [{taken}]" in found.description
+
+
+def test_minutes_that_may_be_hours_are_asked_for(tmp_path):
+    """600 rows 00:00 to 09:59, a second apart as a spreadsheet saves them, would be 10 minutes or 10 hours."""
+    path = write_table(
+        tmp_path / "a.csv", ("time", *HEADINGS[1:]), of_clock(1, "{m:02}:{s:02}"), 500
+    )
+    words = "minutes and seconds or hours and minutes: .*--time 0:min or --time 0:h, .*mm:ss"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(path)
+    assert read_measurement(path, {"time": "0:min"}).time[-1] == 499.0
+    assert read_measurement(path, {}, sample_time=0.5).time[-1] == 249.5
 
 
 def test_columns_by_number_and_by_a_part_of_the_name(tmp_path):

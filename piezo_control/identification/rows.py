@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from piezo_control.identification.units import UNITS, split_name, unit_of
+from piezo_control.identification.units import UNITS, said_unit, unit_of
 
 COMMENTS = ("#", "%")
 JUDGED = 50  # rows at the end, which have numbers
@@ -34,7 +34,7 @@ class Layout(NamedTuple):
     """What is where: rows of numbers, as wide as there are names."""
 
     names: list[str]  # '0', '1', … for a table without any
-    units: list[str]  # '' where none is said
+    units: list[str]  # '' where none is said, the word that is said where it is none of UNITS
     rows: list[Row]
     decimal: str
     above: int  # rows above the names
@@ -191,8 +191,8 @@ def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], 
     if at and not rows[at - 1].comment and 2 * sum(given) >= len(given):
         names = rows[at - 1].cells[: _length(rows[at - 1].cells)]
         told += [""] * len(names)
-        return names, [u if u in UNITS else split_name(n)[1] for u, n in zip(told, names)], at - 1
-    return words, [split_name(word)[1] for word in words], at
+        return names, [unit or said_unit(name) for unit, name in zip(told, names)], at - 1
+    return words, [said_unit(word) for word in words], at
 
 
 def _length(cells: list[str]) -> int:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from piezo_control.identification.arrays import READERS, absent, read_vectors
 from piezo_control.identification.rows import Row, layout, numbered, read_rows, with_points
-from piezo_control.identification.units import UNITS, split_name, unit_of
+from piezo_control.identification.units import UNITS, said_unit, split_name, unit_of
 from piezo_control.safety import LARGEST_DEFLECTION
 
 LARGEST_MISSING_SHARE = 0.01  # of the rows
@@ -34,7 +34,7 @@ class Table:
 
     path: Path
     headers: list[str]  # '0', '1', … for a file without a line of names
-    units: list[str]  # '' where the file says none
+    units: list[str]  # '' where the file says none, its word where that is none of UNITS
     cells: pd.DataFrame
     rows: NDArray[np.int64]
     decimal: str = "."
@@ -42,16 +42,16 @@ class Table:
 
     def find(
         self, quantity: str, wanted: str | None, units: tuple[str, ...]
-    ) -> tuple[int, str] | None:
-        """Return index and unit of the column of a `quantity`, None when there is none.
+    ) -> tuple[int, str, NDArray[np.float64]] | None:
+        """Return index, unit and values (SI) of the column of a `quantity`, None when there is none.
 
         `wanted` is NAME, NUMBER or a part of the name that only one column has, with ':UNIT' behind it where
         the file does not say; without it the quantity is looked for under its own name. The first of
-        `units` holds where nothing says another one. Raises TableError for what is not there.
+        `units` holds where nothing says another one. Raises TableError for what is not there, and for a unit that is not understood.
         """
-        name, _, unit = (wanted or quantity).rpartition(":") if ":" in (wanted or "") else (
-            wanted or quantity, "", "",
-        )  # fmt: skip
+        name, unit = wanted or quantity, ""
+        if ":" in name and name not in self.headers:
+            name, _, unit = name.rpartition(":")
         if unit and unit_of(unit) not in units:
             raise TableError(
                 f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
@@ -64,13 +64,16 @@ class Table:
                 f"{self.path}: no column '{name}' for '{quantity}'; the file has "
                 f"{', '.join(self.headers)}"
             )
-        unit = unit_of(unit) or self.units[index] or units[0]
-        if unit not in units:
+        unit = unit_of(unit) or self.units[index]
+        if quantity == "time" and (clock := self._clock(index, unit)):
+            return index, *clock
+        if (unit := unit or units[0]) not in units:
+            option = f"--{quantity.replace('_', '-')} {index}:{units[0]}"
             raise TableError(
                 f"{self.path}: column '{self.headers[index]}' is in {unit}, '{quantity}' must be in one of "
-                f"{', '.join(units)}"
+                f"{', '.join(units)}; where '{unit}' is wrong or no unit, say the unit, as in {option}"
             )
-        return index, unit
+        return index, unit, self.numbers(index) * UNITS[unit]
 
     def _index(self, name: str, quantity: str, exact: bool) -> int | None:
         def plain(text: str) -> str:
@@ -103,14 +106,14 @@ class Table:
         return found[0]
 
     def numbers(self, index: int) -> NDArray[np.float64]:
-        """Return a column as numbers, NaN where a cell is empty; dates become seconds since the first.
+        """Return a column as numbers, NaN where a cell is empty.
 
         Raises TableError for the first cell that is no number.
         """
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
-        text = plain = column
+        text = column
         written = (text != "").to_numpy()
         values = pd.to_numeric(text, errors="coerce").to_numpy(float)
         if np.any(np.isnan(values) & written):
@@ -118,10 +121,6 @@ class Table:
             values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
         # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
         unread = np.isnan(values) & written
-        if unread.size and unread.all():
-            dates = pd.to_datetime(plain, errors="coerce", format="mixed")
-            if dates.notna().all():
-                return (dates - dates.iloc[0]).dt.total_seconds().to_numpy(float)
         if unread.any():
             row = int(np.flatnonzero(unread)[0])
             raise TableError(
@@ -129,6 +128,38 @@ class Table:
                 f"'{text.iloc[row]}', must be a finite number"
             )
         return values
+
+    def _clock(self, index: int, unit: str) -> tuple[str, NDArray[np.float64]] | None:
+        """Return how a column writes instants, and these in seconds since the first; None for numbers.
+
+        Raises TableError for times that may be minutes and seconds or hours and minutes, unless `unit` says which.
+        """
+        column = self.cells.iloc[:, index]
+        if column.dtype != object:
+            return None
+        text = with_points(column[column != ""], self.decimal)
+        if pd.to_numeric(text.iloc[:1], errors="coerce").notna().any() or text.empty:
+            return None
+        parts = text.str.extract(r"^(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)$").astype(float)
+        first, second = parts[1], parts[2]
+        if second.isna().any():
+            dates = pd.to_datetime(text, errors="coerce", format="mixed")
+            if dates.isna().any():
+                return None
+            form, seconds = "date", (dates - dates.iloc[0]).dt.total_seconds()
+        elif parts[0].notna().any():
+            form, seconds = "h:min:s", 3600.0 * parts[0].fillna(0.0) + 60.0 * first + second
+        elif unit == "min" or first.max() >= 24.0 or text.str.contains(".", regex=False).any():
+            form, seconds = "min:s", 60.0 * first + second
+        elif unit == "h":
+            form, seconds = "h:min", 3600.0 * first + 60.0 * second
+        else:
+            raise TableError(
+                f"{self.path}: column '{self.headers[index]}' has times as '{text.iloc[-1]}', which are minutes and "
+                "seconds or hours and minutes: say the unit before the colon, as in "
+                f"--time {index}:min or --time {index}:h, or in the heading, as in [mm:ss] or [hh:mm]"
+            )
+        return form, (seconds - seconds.iloc[0]).reindex(column.index).to_numpy(float)
 
 
 @dataclass(frozen=True)
@@ -165,23 +196,25 @@ def read_columns(
     if table.headers == numbered(len(table.headers)) and not columns:
         wanted = ["time", *needed] if sample_time is None else needed
         columns = _in_order(table, wanted, quantities)
-    found = {q: table.find(q, columns.get(q), units) for q, units in quantities.items()}
-    if sample_time is not None:
-        found["time"] = None
+    found = {
+        quantity: table.find(quantity, columns.get(quantity), units)
+        for quantity, units in quantities.items()
+        if quantity != "time" or sample_time is None
+    }
     has = f"the file has {', '.join(table.headers)}: say which column it is"
     for quantity in needed:
         if found[quantity] is None:
             raise TableError(f"{path}: no column for '{quantity}'; {has}, as in --{quantity} 1")
-    if found["time"] is None and sample_time is None:
+    if sample_time is None and found["time"] is None:
         raise TableError(f"{path}: no column for 'time' and no sample time given; {has}")
     places = {quantity: place for quantity, place in found.items() if place}
-    of_column = {index: quantity for quantity, (index, _) in places.items()}
-    for quantity, (index, _) in places.items():
+    of_column = {index: quantity for quantity, (index, *_) in places.items()}
+    for quantity, (index, *_) in places.items():
         if of_column[index] != quantity:
             raise TableError(
                 f"{path}: column '{table.headers[index]}' cannot be both '{quantity}' and '{of_column[index]}'"
             )
-    values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
+    values = {quantity: si for quantity, (*_, si) in places.items()}
     if sample_time is not None:
         values["time"] = sample_time * np.arange(len(table.rows))
     empty = np.any([np.isnan(column) for column in values.values()], axis=0)
@@ -200,7 +233,7 @@ def read_columns(
             f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
             "unit, as in --deflection COLUMN:um"
         )
-    words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit) in places.items()]
+    words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit, _) in places.items()]
     if sample_time is not None:
         words.insert(0, f"time = rows {sample_time:g} s apart")
     left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
@@ -268,7 +301,7 @@ def _read_vectors(path: Path) -> Table:
         raise TableError(f"{path}: {error}") from None
     headers = [vector.name for vector in vectors]
     told = [unit_of(vector.unit) for vector in vectors]
-    units = [u if u in UNITS else split_name(header)[1] for u, header in zip(told, headers)]
+    units = [unit or said_unit(header) for unit, header in zip(told, headers)]
     # Not by name: two of them may have the same.
     cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
     return Table(path, headers, units, cells, np.arange(len(cells)), form="vectors by name")
