@@ -264,6 +264,61 @@ def test_a_table_without_names_has_its_columns_in_order(tmp_path):
         read_measurement(path)
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("um", 1e6), ("nm", 1e9), ("mm", 1e3), ("m", 1.0)])
+@pytest.mark.parametrize("gain", [0.44e-6, 0.054e-6, 15e-6])
+def test_a_small_stroke_without_names_is_not_taken_for_a_large_one(tmp_path, gain, unit, scale):
+    """2 V on the paper's finger give 0.9 µm; a PICMA stack P-882.11 6.5 µm/120 V, a bender PL128.10 15 µm/V."""
+    path = tmp_path / "a.txt"
+    path.write_text(
+        "\n".join(f"{k / 10}\t{k % 3}\t{gain * scale * (k % 3):.9f}" for k in range(60))
+    )
+    found = read_measurement(path)
+    assert np.ptp(found.deflection) == pytest.approx(2.0 * gain, rel=0.01)
+    assert "without names: this order and these units assumed" in found.description
+    assert f"deflection = column '2' [{unit}]" in found.description
+
+
+@pytest.mark.parametrize(
+    ("stroke", "voltage", "words"),
+    [
+        (60.0, 2, "spans 60 under 2 V may be in um or nm"),  # of a bender, 30 µm/V, or 30 nm/V of a stack
+        (60.0, 0, "spans 60 may be in um or nm"),
+        (5e3, 1e-3, "spans 5000 under 0.001 V may be in m or mm or um or nm"),  # in none that is known
+    ],
+)  # fmt: skip
+def test_a_stroke_without_names_that_may_have_two_units_is_asked_for(
+    tmp_path, stroke, voltage, words
+):
+    path = tmp_path / "a.txt"
+    path.write_text("".join(f"{k} {voltage * (k % 2)} {stroke * (k % 2)}\n" for k in range(60)))
+    options = "--time 0 --voltage 1 --deflection 2:um"
+    with pytest.raises(MeasurementError, match=f"no names, .*{words}: .* as in {options}"):
+        read_measurement(path)
+    columns = {"time": "0", "voltage": "1", "deflection": "2:nm"}
+    assert np.ptp(read_measurement(path, columns).deflection) == pytest.approx(stroke * 1e-9)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", '","'])
+def test_marks_between_thousands_are_not_taken_for_decimal_ones(tmp_path, separator):
+    """88 µm in nm, 88,200 or 88.200; with a 0,500 or 12.50 anywhere, or decimals in each cell, they are decimals."""
+    path = tmp_path / "a.csv"
+    quote = separator[0] * (len(separator) > 1)
+
+    def write(mark, first, column):
+        rows = [[str(k), first, column(k).replace(",", mark)] for k in range(60)]
+        text = [["time", "voltage (V)", "deflection (nm)"], *rows]
+        path.write_text("".join(f"{quote}{separator.join(row)}{quote}\n" for row in text))
+        return read_measurement(path)
+
+    for mark in ",.":
+        with pytest.raises(MeasurementError, match=f"'1\\{mark}470' is 1470, or has decimals"):
+            write(mark, "5", lambda k: f"{1470 * k:,}")
+    with pytest.raises(MeasurementError, match="'1,000' is 1000, or has decimals"):
+        write(",", "5", lambda k: f"{1000 + k:,}")
+    assert write(",", "0,500", lambda k: f"1,{100 + k}").deflection[-1] == pytest.approx(1.159e-9)
+    assert write(".", "5", lambda k: f"1.{100 + k}").deflection[-1] == pytest.approx(1.159e-9)
+
+
 def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     path = tmp_path / "a.csv"
     rows = [f"{0.1 * k:.1f},{k % 7},{2 * k}" for k in range(200)]

@@ -172,6 +172,7 @@ def layout(rows: list[Row]) -> Layout:
                 f"row {row.number} has {len(row.cells)} cells, must have at most {width}"
             )
     whole = [Row(row.number, (row.cells + [""] * width)[:width]) for row in below]
+    _refuse_thousands(whole, decimal)
     return Layout(names, units, whole, decimal, sum(not row.comment for row in rows[: max(at, 0)]))
 
 
@@ -181,6 +182,27 @@ def _decimal(shown: list[list[str]]) -> str:
     commas = any(re.fullmatch(r"[-+−]?\d*,\d+([eE][-+]?\d+)?", cell) for cell in cells)
     points = any(re.fullmatch(r"[-+−]?[\d,]*\.\d*([eE][-+]?\d+)?", cell) for cell in cells)
     return "," if commas and not points else "."
+
+
+def _refuse_thousands(rows: list[Row], decimal: str) -> None:
+    """Raise ValueError where what is taken for a decimal mark may as well be between thousands.
+
+    Both have three digits behind them. A decimal comma is known by any number of the table that cannot be thousands,
+    as 0,123; a decimal point by every number of the column having one.
+    """
+    thousands = re.compile(rf"[-+−]?[1-9]\d{{0,2}}([{decimal}]\d{{3}})+")
+    doubtful, known = "", False
+    for column in zip(*(row.cells for row in rows)):
+        marked = [cell for cell in column if decimal in cell]
+        if not all(thousands.fullmatch(cell) for cell in marked):
+            known = decimal == ","
+        elif marked and (decimal == "," or any(c.lstrip("-+−").isdigit() for c in column)):
+            doubtful = marked[0]
+    if doubtful and not known:
+        raise ValueError(
+            f"'{doubtful}' is {doubtful.replace(decimal, '')}, or has decimals: numbers with three digits behind each "
+            f"'{decimal}' may be either; write them without marks between thousands, decimals with more digits"
+        )
 
 
 def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], int]:

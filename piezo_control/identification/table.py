@@ -22,6 +22,7 @@ from piezo_control.identification.units import UNITS, said_unit, split_name, uni
 from piezo_control.safety import LARGEST_DEFLECTION
 
 LARGEST_MISSING_SHARE = 0.01  # of the rows
+GAINS = 0.02e-6, 50e-6  # m/V, of a small stack without a lever, and of a bender
 
 
 class TableError(ValueError):
@@ -196,6 +197,7 @@ def read_columns(
     if table.headers == numbered(len(table.headers)) and not columns:
         wanted = ["time", *needed] if sample_time is None else needed
         columns = _in_order(table, wanted, quantities)
+        table.form += ", without names: this order and these units assumed" if columns else ""
     found = {
         quantity: table.find(quantity, columns.get(quantity), units)
         for quantity, units in quantities.items()
@@ -249,16 +251,36 @@ def _in_order(
 ) -> dict[str, str]:
     """Return where the `wanted` quantities are in a table without names: in this order, if no column is left.
 
-    A deflection is in the largest unit in which a finger moves that far.
+    A deflection is in the unit in which a finger moves that far under such voltages. Raises TableError where that
+    is not just one.
     """
     filled = np.flatnonzero((table.cells != "").any())
     if len(filled) != len(wanted):
         return {}
     places = {quantity: str(i) for quantity, i in zip(wanted, filled)}
     if "deflection" in places:
-        stroke = np.ptp(np.nan_to_num(table.numbers(int(places["deflection"]))))
-        possible = [u for u in quantities["deflection"] if stroke * UNITS[u] <= LARGEST_DEFLECTION]
-        places["deflection"] += f":{possible[0]}" if possible else ""
+        span = {
+            q: float(np.ptp(np.nan_to_num(table.numbers(int(i)))))
+            for q, i in places.items()
+            if q != "time"
+        }
+        stroke, voltage = span["deflection"], span.get("voltage", 0.0)
+        possible = [
+            unit
+            for unit in quantities["deflection"]
+            if stroke * UNITS[unit] <= LARGEST_DEFLECTION
+            and (not voltage or GAINS[0] <= stroke * UNITS[unit] / voltage <= GAINS[1])
+        ]
+        if len(possible) != 1:
+            under = f" under {voltage:g} V" if voltage else ""
+            options = " ".join(
+                f"--{quantity.replace('_', '-')} {i}" for quantity, i in places.items()
+            )
+            raise TableError(
+                f"{table.path}: no names, and a deflection that spans {stroke:g}{under} may be in "
+                f"{' or '.join(possible or quantities['deflection'])}: say its unit, as in {options}:um"
+            )
+        places["deflection"] += f":{possible[0]}"
     return places
 
 
