@@ -319,6 +319,28 @@ def test_marks_between_thousands_are_not_taken_for_decimal_ones(tmp_path, separa
     assert write(".", "5", lambda k: f"1.{100 + k}").deflection[-1] == pytest.approx(1.159e-9)
 
 
+@pytest.mark.parametrize("number", ["{:.4f}", "{:.3e}", "{:d}"])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_a_row_that_the_end_of_the_file_cuts_is_left_out(tmp_path, number, order):
+    """Wherever the writing stopped: what is read has been written, be the last row whole, cut or left out."""
+    path = tmp_path / "a.csv"
+    rows = [(f"{0.1 * k:.2f}", number.format(100 + k), number.format(500 - k)) for k in range(60)]
+    lines = [
+        ",".join(cells[i] for i in order) for cells in [("time", "voltage", "deflection_nm"), *rows]
+    ]
+    text = "\n".join(lines)
+    last = len(lines[-1])
+    for cut in range(last + 1):
+        path.write_text(text[: len(text) - cut])
+        found = read_measurement(path)
+        count = 60 if cut == 0 else 59
+        assert len(found.time) == count
+        np.testing.assert_allclose(found.voltage, 100.0 + np.arange(count))
+        np.testing.assert_allclose(found.deflection, 1e-9 * (500.0 - np.arange(count)))
+        said = "row 61 left out, where the file ends within a number"
+        assert (said in found.description) == (0 < cut < last)
+
+
 def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     path = tmp_path / "a.csv"
     rows = [f"{0.1 * k:.1f},{k % 7},{2 * k}" for k in range(200)]

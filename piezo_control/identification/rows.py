@@ -19,6 +19,7 @@ import pandas as pd
 from piezo_control.identification.units import UNITS, said_unit, unit_of
 
 COMMENTS = ("#", "%")
+NUMBER = re.compile(r"[-+−]?[\d.,]*\d[.,]?([eEdD][-+]?\d+)?")
 JUDGED = 50  # rows at the end, which have numbers
 
 
@@ -45,9 +46,8 @@ def read_rows(data: bytes) -> tuple[list[Row], str]:
 
     Raises ValueError for what is no text.
     """
-    lines = [
-        (number, line) for number, line in enumerate(_decode(data).splitlines(), 1) if line.strip()
-    ]
+    text = _decode(data)
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     written = [line for _, line in lines if not line.lstrip().startswith(COMMENTS)]
     if not written:
         return [], ""
@@ -62,7 +62,27 @@ def read_rows(data: bytes) -> tuple[list[Row], str]:
         if any(cells):
             rows.append(Row(number, cells, comment))
     spelled = {"\t": "tabs", " ": "blanks"}.get(separator, f"'{separator}'")
-    return rows, f"separated by {spelled}"
+    form = f"separated by {spelled}"
+    is_open = rows and not rows[-1].comment and not text.endswith(("\n", "\r"))
+    if is_open and _is_cut([row.cells for row in rows if not row.comment]):
+        form += f", row {rows.pop().number} left out, where the file ends within a number"
+    return rows, form
+
+
+def _is_cut(rows: list[list[str]]) -> bool:
+    """Tell whether the last row has fewer cells than most, or a last number of fewer digits than all others."""
+    *others, last = rows
+    width = Counter(map(len, others)).most_common(1)[0][0] if others else 0
+    numbers = [
+        cells[-1] for cells in others if len(cells) == len(last) and NUMBER.fullmatch(cells[-1])
+    ]
+    marked = any(re.search("[.,]", cell) for cell in numbers)
+
+    def digits(cell: str) -> int:  # with what is behind them, as an exponent
+        parts = re.split("[.,]", cell)
+        return len(parts[-1]) if len(parts) > 1 or not marked else 0
+
+    return len(last) < width or digits(last[-1]) < min(map(digits, numbers), default=0)
 
 
 def _decode(data: bytes) -> str:
