@@ -119,6 +119,23 @@ def test_a_measurement_comes_back_from_any_shape(tmp_path_factory, shape):
         np.testing.assert_allclose(getattr(found, quantity), values, rtol=1e-12, atol=1e-20)
 
 
+@pytest.mark.parametrize("comment", ["\tComment", ""])
+@pytest.mark.parametrize("end", ["\t", ""])
+def test_labview_names_a_comment_that_no_row_has_and_units_above(tmp_path, comment, end):
+    """As NI's "Specification for the LabVIEW Measurement File" has them: Y_Unit_Label, one for each channel."""
+    path = tmp_path / "a.lvm"
+    text = (
+        (FORMATS / "labview.lvm")
+        .read_text()
+        .replace("Voltage\tDeflection [um]\tComment", f"CH0\tCH1{comment}")
+    )
+    text = text.replace("X0\t", "Y_Unit_Label\tmV\tum\t\nX0\t").replace("\t\n0.", f"{end}\n0.")
+    path.write_text(text)
+    found = read_measurement(path, {"time": "X_Value", "voltage": "CH0", "deflection": "CH1"})
+    np.testing.assert_allclose(found.voltage, 1e-3 * VOLTAGE, atol=1e-12)
+    np.testing.assert_allclose(found.deflection, 0.5e-6 * VOLTAGE, atol=1e-10)
+
+
 DAMAGES = {
     "a word in a cell": lambda rows, k: rows[k].__setitem__(0, "low"),
     "a cell too many": lambda rows, k: rows[k].extend(["7.0", "8.0"]),
@@ -337,7 +354,7 @@ def test_a_row_that_the_end_of_the_file_cuts_is_left_out(tmp_path, number, order
         assert len(found.time) == count
         np.testing.assert_allclose(found.voltage, 100.0 + np.arange(count))
         np.testing.assert_allclose(found.deflection, 1e-9 * (500.0 - np.arange(count)))
-        said = "row 61 left out, where the file ends within a number"
+        said = "row 61 left out, where the file ends within a row"
         assert (said in found.description) == (0 < cut < last)
 
 

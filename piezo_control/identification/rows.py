@@ -65,7 +65,7 @@ def read_rows(data: bytes) -> tuple[list[Row], str]:
     form = f"separated by {spelled}"
     is_open = rows and not rows[-1].comment and not text.endswith(("\n", "\r"))
     if is_open and _is_cut([row.cells for row in rows if not row.comment]):
-        form += f", row {rows.pop().number} left out, where the file ends within a number"
+        form += f", row {rows.pop().number} left out, where the file ends within a row"
     return rows, form
 
 
@@ -180,11 +180,18 @@ def layout(rows: list[Row]) -> Layout:
     if at >= 0 and not (_length(rows[at].cells) == 1 < width):
         names, units, at = _named(rows, at, width)
         filled = max(map(_length, shown))
+        if (
+            len(names) > filled and names[-1].lower() == "comment"
+        ):  # of LabVIEW, mostly without cells
+            names, units = names[:-1], units[:-1]
         if not filled <= len(names) <= width:
             raise ValueError(
                 f"row {rows[at].number} has {len(names)} names, the rows below it have {filled} cells: which is "
                 "which cannot be known; make them equally many"
             )
+        labels = [row.cells[1:] for row in rows[:at] if row.cells[0] == "Y_Unit_Label"]  # LabVIEW's
+        said = ["", *(labels or [[]])[-1], *[""] * len(units)]
+        units = [unit or unit_of(label) for unit, label in zip(units, said)]
         names, units = ((entries + [""] * width)[:width] for entries in (names, units))
     for row in below:
         if any(row.cells[width:]):
