@@ -367,6 +367,48 @@ def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     assert len(found.time) == 199 and "1 rows with empty cells left out" in found.description
 
 
+@pytest.mark.parametrize(
+    "word",
+    [
+        "NaN",
+        "nan",
+        "-nan",
+        "#N/A",
+        "N/A",
+        "#NV",
+        "#DIV/0!",
+        "-",
+        "--",
+        "1.#QNAN",
+        "-1.#IND00",
+        "null",
+    ],
+)
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_word_for_no_number_is_as_good_as_an_empty_cell(tmp_path, word, place):
+    """As C, NumPy, Excel in English and German, and instruments write it; in each column, in the first row and the last."""
+    path = tmp_path / "a.csv"
+    table = [[f"{0.1 * k:.1f}", f"{k % 7}", f"{2 * k}"] for k in range(400)]
+    rows = [0, 150, 399]
+    for row in rows:
+        table[row][place] = word
+    for names in (["time", "voltage", "deflection_um"], []):
+        path.write_text("".join(",".join(row) + "\n" for row in ([names] if names else []) + table))
+        columns = {} if names else {"time": "0", "voltage": "1", "deflection": "2:um"}
+        found = read_measurement(path, columns)
+        kept = np.delete(np.arange(400), rows)
+        np.testing.assert_allclose(found.time, 0.1 * kept)
+        np.testing.assert_allclose(found.deflection, 2e-6 * kept)
+        assert "3 rows with empty cells left out" in found.description
+
+
+def test_a_row_of_words_for_no_number_has_no_names(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("nan,nan,nan\n" + "".join(f"{k},{k % 7},{2 * k}\n" for k in range(200)))
+    found = read_measurement(path, {"time": "0", "voltage": "1", "deflection": "2:um"})
+    assert len(found.time) == 200
+
+
 @given(st.binary(max_size=400))
 @settings(deadline=None)
 def test_rubbish_is_refused_in_words(tmp_path_factory, data):

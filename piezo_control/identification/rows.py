@@ -18,7 +18,9 @@ import pandas as pd
 
 from piezo_control.identification.units import UNITS, said_unit, unit_of
 
-COMMENTS = ("#", "%")
+MISSING = re.compile(r"(?i)|-+|-?nan|-?1\.#(ind|qnan)\w*|n/?a|null|none|#(n/a|nv|[a-z]+/?0?!)")
+"""What programs write for no number; Excel's begin like a comment."""
+COMMENT = re.compile(r"(?i)\s*(#(?!n/a|nv\b|\w+/?0?!)|%)[#%]*")
 NUMBER = re.compile(r"[-+−]?[\d.,]*\d[.,]?([eEdD][-+]?\d+)?")
 JUDGED = 50  # rows at the end, which have numbers
 
@@ -48,19 +50,17 @@ def read_rows(data: bytes) -> tuple[list[Row], str]:
     """
     text = _decode(data)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
-    written = [line for _, line in lines if not line.lstrip().startswith(COMMENTS)]
+    written = [line for _, line in lines if not COMMENT.match(line)]
     if not written:
         return [], ""
     votes = Counter(map(_separator, written[-JUDGED:]))
     separator = votes.most_common(1)[0][0]
     rows = []
     for number, line in lines:
-        comment = line.lstrip().startswith(COMMENTS)
-        if comment:
-            line = line.lstrip().lstrip("".join(COMMENTS))
-        cells = _split(line, separator)
+        comment = COMMENT.match(line)
+        cells = _split(line[comment.end() :] if comment else line, separator)
         if any(cells):
-            rows.append(Row(number, cells, comment))
+            rows.append(Row(number, cells, bool(comment)))
     spelled = {"\t": "tabs", " ": "blanks"}.get(separator, f"'{separator}'")
     form = f"separated by {spelled}"
     is_open = rows and not rows[-1].comment and not text.endswith(("\n", "\r"))
@@ -160,12 +160,13 @@ def layout(rows: list[Row]) -> Layout:
     numeric = [i for i in range(width) if 2 * sum(vote[i] for vote in votes) > len(votes)]
 
     def fits(row: Row) -> bool:
-        given = [i for i in numeric if i < len(row.cells) and row.cells[i]]
+        given = [i for i in numeric if i < len(row.cells) and not MISSING.fullmatch(row.cells[i])]
         known = _are_numbers(row.cells, decimal)
         return not row.comment and bool(given) and all(known[i] for i in given)
 
     def of_words(row: Row) -> bool:
-        return not any(_are_numbers(row.cells, decimal))
+        is_said = not all(map(MISSING.fullmatch, row.cells))
+        return is_said and not any(_are_numbers(row.cells, decimal))
 
     first = next((i for i, row in enumerate(rows) if fits(row)), len(rows))
     at = next(

@@ -17,7 +17,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from piezo_control.identification.arrays import READERS, absent, read_vectors
-from piezo_control.identification.rows import Row, layout, numbered, read_rows, with_points
+from piezo_control.identification.rows import MISSING, Row, layout, numbered, read_rows, with_points
 from piezo_control.identification.units import UNITS, said_unit, split_name, unit_of
 from piezo_control.safety import LARGEST_DEFLECTION
 
@@ -107,26 +107,24 @@ class Table:
         return found[0]
 
     def numbers(self, index: int) -> NDArray[np.float64]:
-        """Return a column as numbers, NaN where a cell is empty.
+        """Return a column as numbers, NaN where a cell is empty or says that there is none.
 
         Raises TableError for the first cell that is no number.
         """
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
-        text = column
-        written = (text != "").to_numpy()
-        values = pd.to_numeric(text, errors="coerce").to_numpy(float)
-        if np.any(np.isnan(values) & written):
-            plain = with_points(text, self.decimal)
+        values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+        unread = np.isnan(values) & (column != "").to_numpy()
+        if unread.any():
+            plain = with_points(column, self.decimal)
             values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
-        # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
-        unread = np.isnan(values) & written
+            unread = np.isnan(values) & ~column.str.fullmatch(MISSING).to_numpy(bool)
         if unread.any():
             row = int(np.flatnonzero(unread)[0])
             raise TableError(
                 f"{self.path}: column '{self.headers[index]}', row {self.rows[row]} is "
-                f"'{text.iloc[row]}', must be a finite number"
+                f"'{column.iloc[row]}', must be a finite number"
             )
         return values
 
@@ -138,7 +136,7 @@ class Table:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return None
-        text = with_points(column[column != ""], self.decimal)
+        text = with_points(column[~column.str.fullmatch(MISSING)], self.decimal)
         if pd.to_numeric(text.iloc[:1], errors="coerce").notna().any() or text.empty:
             return None
         parts = text.str.extract(r"^(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)$").astype(float)
@@ -221,9 +219,12 @@ def read_columns(
         values["time"] = sample_time * np.arange(len(table.rows))
     empty = np.any([np.isnan(column) for column in values.values()], axis=0)
     if empty.sum() > LARGEST_MISSING_SHARE * empty.size:
+        row = int(np.argmax(empty))
+        index = next(i for q, (i, *_) in places.items() if np.isnan(values[q][row]))
         raise TableError(
-            f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
-            f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
+            f"{path}: column '{table.headers[index]}', row {table.rows[row]} is '{table.cells.iloc[row, index]}', must "
+            f"be a finite number: {empty.sum()} of {empty.size} rows have an empty cell or no number in a column that "
+            f"is needed, the first is row {table.rows[row]}; at most {LARGEST_MISSING_SHARE:.0%} may"
         )
     stroke = (
         float(np.ptp(values["deflection"][~empty]))
