@@ -178,6 +178,15 @@ def test_even_sampling_with_few_digits_of_time_is_even():
             measured(time=late).need_even_sampling()
 
 
+def test_a_clock_as_coarse_as_the_rows_may_be_replaced(tmp_path):
+    """100 Hz in single precision 1e5 s after the clock's begin, a digit is 1/128 s, of 20 s: 99.99 is as near as it tells."""
+    time = (1e5 + np.arange(TIME.size) / 100.0).astype(np.float32)
+    with pytest.raises(
+        MeasurementError, match="rows are missing in .*coarse, --sample-rate 99.989 in"
+    ):
+        measured(time=time.astype(float)).clock()
+
+
 def test_a_resonance_seen_by_a_clock_of_few_digits_is_where_it_is():
     """900 Hz at 30 kHz: the samples are a model's at the exact times, the clock rounds them."""
     time = np.arange(3000) / 3e4

@@ -132,7 +132,10 @@ class Measurement:
             lost = f"{missing:,} rows are missing in {gaps.size} gaps"
             if missing > LARGEST_MISSING_SHARE * (steps.size + missing):
                 text = f"{steps[gaps[0]]:.4g} s after the row before, rows come every {self.sample_time:.4g} s: {lost}"
-                raise self.error("time", int(gaps[0]) + 1, f"{text}; use a part without them")
+                text += "; use a part without them"
+                if np.ptp(steps) < 1.01 * self.sample_time:
+                    text += f", or where the clock is coarse, --sample-rate {1.0 / np.mean(steps):.5g} in its place"
+                raise self.error("time", int(gaps[0]) + 1, text)
             said.append(f"{lost}, the first before row {self.rows[gaps[0] + 1]}")
         even = np.delete(steps, gaps) / self.sample_time
         if np.std(even) > LARGEST_JITTER and not self._is_even():

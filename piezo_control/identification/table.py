@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -40,6 +41,21 @@ class Table:
     rows: NDArray[np.int64]
     decimal: str = "."
     form: str = ""
+    others: list[str] = field(default_factory=list)  # names of what is not as long
+
+    @property
+    def contents(self) -> str:
+        """What can be chosen from, for people."""
+        others = f"; not as long: {', '.join(self.others)}" if self.others else ""
+        return ", ".join(self.headers) + others
+
+    def has(self, wanted: Mapping[str, str | None]) -> bool:
+        """Tell whether there are columns of all `wanted` quantities."""
+        return all(
+            self._index(self._parts(column, quantity)[0], quantity, exact=column is None)
+            is not None
+            for quantity, column in wanted.items()
+        )
 
     def find(
         self, quantity: str, wanted: str | None, units: tuple[str, ...]
@@ -50,20 +66,17 @@ class Table:
         the file does not say; without it the quantity is looked for under its own name. The first of
         `units` holds where nothing says another one. Raises TableError for what is not there, and for a unit that is not understood.
         """
-        name, unit = wanted or quantity, ""
-        if ":" in name and name not in self.headers:
-            name, _, unit = name.rpartition(":")
+        name, unit = self._parts(wanted, quantity)
         if unit and unit_of(unit) not in units:
             raise TableError(
                 f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
             )
-        index = self._index(name or quantity, quantity, exact=wanted is None)
+        index = self._index(name, quantity, exact=wanted is None)
         if index is None:
             if wanted is None:
                 return None
             raise TableError(
-                f"{self.path}: no column '{name}' for '{quantity}'; the file has "
-                f"{', '.join(self.headers)}"
+                f"{self.path}: no column '{name}' for '{quantity}'; the file has {self.contents}"
             )
         unit = unit_of(unit) or self.units[index]
         if quantity == "time" and (clock := self._clock(index, unit)):
@@ -75,6 +88,15 @@ class Table:
                 f"{', '.join(units)}; where '{unit}' is wrong or no unit, say the unit, as in {option}"
             )
         return index, unit, self.numbers(index) * UNITS[unit]
+
+    def _parts(self, wanted: str | None, quantity: str) -> tuple[str, str]:
+        """Return the name and the unit in NAME or NAME:UNIT; some names have a colon."""
+        name, colon, unit = (wanted or "").rpartition(":")
+        return (
+            (name or quantity, unit)
+            if colon and wanted not in self.headers
+            else (wanted or quantity, "")
+        )
 
     def _index(self, name: str, quantity: str, exact: bool) -> int | None:
         def plain(text: str) -> str:
@@ -191,9 +213,9 @@ def read_columns(
     Rows in which a cell that is needed is empty are left out, if they are few. Raises TableError, naming file,
     column and row.
     """
-    table = read_table(path)
+    wanted = ["time", *needed] if sample_time is None else needed
+    table = read_table(path, {quantity: columns.get(quantity) for quantity in wanted})
     if table.headers == numbered(len(table.headers)) and not columns:
-        wanted = ["time", *needed] if sample_time is None else needed
         columns = _in_order(table, wanted, quantities)
         table.form += ", without names: this order and these units assumed" if columns else ""
     found = {
@@ -201,7 +223,7 @@ def read_columns(
         for quantity, units in quantities.items()
         if quantity != "time" or sample_time is None
     }
-    has = f"the file has {', '.join(table.headers)}: say which column it is"
+    has = f"the file has {table.contents}: say which column it is"
     for quantity in needed:
         if found[quantity] is None:
             raise TableError(f"{path}: no column for '{quantity}'; {has}, as in --{quantity} 1")
@@ -285,11 +307,14 @@ def _in_order(
     return places
 
 
-def read_table(path: str | Path) -> Table:
-    """Read a table of numbers; raises TableError naming what cannot be read."""
+def read_table(path: str | Path, wanted: Mapping[str, str | None] = MappingProxyType({})) -> Table:
+    """Read a table of numbers; raises TableError naming what cannot be read.
+
+    Of vectors the longest are taken, or the longest among which the `wanted` quantities are, see :meth:`Table.find`.
+    """
     path = Path(path)
     if path.suffix.lower() in READERS:
-        return _read_vectors(path)
+        return _read_vectors(path, wanted)
     if path.suffix.lower() == ".xlsx":
         return _read_sheet(path)
     try:
@@ -317,17 +342,26 @@ def _table(path: Path, rows: list[Row], form: str) -> Table:
     return Table(path, found.names, found.units, cells, numbers, found.decimal, form)
 
 
-def _read_vectors(path: Path) -> Table:
+def _read_vectors(path: Path, wanted: Mapping[str, str | None]) -> Table:
     try:
-        vectors = read_vectors(path)
+        lengths = read_vectors(path)
     except ValueError as error:
         raise TableError(f"{path}: {error}") from None
-    headers = [vector.name for vector in vectors]
-    told = [unit_of(vector.unit) for vector in vectors]
-    units = [unit or said_unit(header) for unit, header in zip(told, headers)]
-    # Not by name: two of them may have the same.
-    cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
-    return Table(path, headers, units, cells, np.arange(len(cells)), form="vectors by name")
+    tables = []
+    for vectors in lengths:
+        headers = [vector.name for vector in vectors]
+        told = [unit_of(vector.unit) for vector in vectors]
+        units = [unit or said_unit(header) for unit, header in zip(told, headers)]
+        # Not by name: two of them may have the same.
+        cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
+        others = [other.name for others in lengths if others is not vectors for other in others]
+        form = "vectors by name" + (
+            f", {len(others)} of other lengths passed over" if others else ""
+        )
+        tables.append(
+            Table(path, headers, units, cells, np.arange(len(cells)), form=form, others=others)
+        )
+    return next((table for table in tables if table.has(wanted)), tables[0])
 
 
 def _read_sheet(path: Path) -> Table:
