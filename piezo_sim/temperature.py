@@ -24,7 +24,7 @@ from piezo_control.parameters import ParameterError, parameter
 from piezo_control.safety import HIGHEST_DEGC, LOWEST_DEGC
 
 COLUMNS = {
-    "time": ("s", "ms", "us", "min"),
+    "time": ("s", "ms", "us", "min", "h"),
     "temperature": ("degc",),
 }  # of a table, with their units
 PROFILES = ("constant", "step", "ramp", "sine", "spotlight", "random_walk", "replay")

@@ -103,6 +103,56 @@ def parquet_with_instants(path):
     return {}
 
 
+def matlab_with_longer_and_shorter_vectors(path):
+    savemat(
+        path, {"preview": np.zeros(500), **SIGNALS, "zero": np.zeros(500), "gains": np.arange(9.0)}
+    )
+    return {}
+
+
+def matlab_with_a_longer_run_of_something_else(path):
+    """The voltage of the one that has a deflection is meant, also where it is only a part of a name."""
+    savemat(path, {"warm": {"time": np.arange(500.0), "voltage": np.zeros(500)}, "loop": SIGNALS})
+    return {"deflection": "deflection_um", "time": "loop.time"}
+
+
+def labview_with_notes_before_waveforms(path):
+    nptdms = pytest.importorskip("nptdms")
+    waveform = {"wf_increment": 0.01, "wf_start_offset": 0.0}
+    channels = [
+        nptdms.ChannelObject("Run", "Note", np.arange(3.0)),
+        nptdms.ChannelObject("Run", "Event", np.arange(5.0), {**waveform, "wf_increment": 1.0}),
+        nptdms.ChannelObject("Run", "Mark", np.arange(80.0)),
+        nptdms.ChannelObject("Run", "Voltage", VOLTAGE, {**waveform, "unit_string": "V"}),
+        nptdms.ChannelObject("Run", "Deflection", DEFLECTION_UM, {**waveform, "unit_string": "um"}),
+    ]
+    with nptdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment(channels)
+    return {}
+
+
+def hdf5_with_units_in_arrays(path):
+    """h5py, and MATLAB's h5writeatt, write a list of one unit as an array."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values, unit in (
+            ("time", 1e3 * TIME, "ms"),
+            ("voltage", VOLTAGE, "V"),
+            ("deflection", DEFLECTION_UM, "µm"),
+        ):
+            file[name] = values
+            file[name].attrs["units"] = [unit]
+    return {}  # fmt: skip
+
+
+def numpy_instants(path):
+    """They become seconds, whatever their name says."""
+    stamps = np.datetime64("2024-05-01") + np.round(TIME * 1e6).astype("timedelta64[us]")
+    with path.open("wb") as file:
+        np.savez(file, time_ms=stamps, voltage=VOLTAGE, deflection_um=DEFLECTION_UM)
+    return {}
+
+
 def spreadsheet(path):
     pytest.importorskip("openpyxl")
     frame = pd.DataFrame({"Time [ms]": 1e3 * TIME, "Voltage (V)": VOLTAGE, "x": DEFLECTION_UM})
@@ -132,7 +182,9 @@ WRITERS = {
     matlab: ".mat", matlab_structure: ".mat", matlab_matrix: ".mat", matlab_7_3: ".mat", hdf5: ".h5",
     hdf5_record: ".hdf5", labview: ".tdms", labview_without_waveforms: ".tdms", parquet: ".parquet",
     parquet_with_instants: ".parquet", spreadsheet: ".xlsx", spreadsheet_with_units_below: ".xlsx",
-    numpy_matrix: ".npy", numpy_record: ".npy",
+    numpy_matrix: ".npy", numpy_record: ".npy", numpy_instants: ".npz", hdf5_with_units_in_arrays: ".h5",
+    matlab_with_longer_and_shorter_vectors: ".mat", matlab_with_a_longer_run_of_something_else: ".mat",
+    labview_with_notes_before_waveforms: ".tdms",
 }  # fmt: skip
 
 
@@ -174,3 +226,12 @@ def test_what_a_file_has_instead_of_vectors_is_said(tmp_path):
     savemat(tmp_path / "a.mat", {"remark": "finger 2", "rate": 100.0})
     with pytest.raises(MeasurementError, match="a.mat: no vectors of numbers; it has remark, rate"):
         read_measurement(tmp_path / "a.mat")
+
+
+def test_vectors_of_all_lengths_are_listed_where_none_fit(tmp_path):
+    savemat(tmp_path / "a.mat", {**SIGNALS, "preview": np.zeros(500)})
+    words = "no column 'x' for 'voltage'; the file has preview; not as long: time, voltage, deflection_um"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(tmp_path / "a.mat", {"voltage": "x"})
+    found = read_measurement(tmp_path / "a.mat")
+    assert "1 of other lengths passed over: time" in found.description

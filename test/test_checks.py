@@ -6,7 +6,7 @@ import pytest
 
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks
-from piezo_control.identification.dynamics import DynamicsModel
+from piezo_control.identification.dynamics import DynamicsModel, identify_dynamics
 from piezo_control.identification.measurement import (
     Measurement,
     MeasurementError,
@@ -155,3 +155,44 @@ def test_a_vibration_that_stops_at_the_end_of_a_sensor_is_refused(side):
         MeasurementError, match="a.csv: .*rows .* stay at .*the sensor is at its end"
     ):
         checks.clipped(measured(cut, STEP, RINGING_TIME))
+
+
+def test_even_sampling_with_few_digits_of_time_is_even():
+    """3 and 30 kHz, time written to the microsecond: steps of 333 and 334, of 33 and 34 µs."""
+    kept = np.delete(np.arange(TIME.size), [500, 501, 900])
+    for rate in (3e3, 3e4):
+        time = np.round(np.arange(TIME.size) / rate, 6)
+        even = measured(time=time)
+        even.need_even_sampling()
+        assert even.sample_time == pytest.approx(1.0 / rate, rel=1e-4)
+        assert even.bridged() is even and even.clock() == []
+        few = measured(DEFLECTION[kept], VOLTAGE[kept], time[kept])
+        assert few.clock() == ["3 rows are missing in 2 gaps, the first before row 502"]
+        with pytest.raises(MeasurementError, match="row 502 is .* after the row before"):
+            few.need_even_sampling()
+        whole = few.bridged()
+        np.testing.assert_allclose(whole.time, time, atol=1.1e-6)
+        whole.need_even_sampling()
+        late = time + np.where(np.arange(TIME.size) == 700, 4e-6, 0.0)
+        with pytest.raises(MeasurementError, match=f"--sample-rate {rate:.0f}"):
+            measured(time=late).need_even_sampling()
+
+
+def test_a_clock_as_coarse_as_the_rows_may_be_replaced(tmp_path):
+    """100 Hz in single precision 1e5 s after the clock's begin, a digit is 1/128 s, of 20 s: 99.99 is as near as it tells."""
+    time = (1e5 + np.arange(TIME.size) / 100.0).astype(np.float32)
+    with pytest.raises(
+        MeasurementError, match="rows are missing in .*coarse, --sample-rate 99.989 in"
+    ):
+        measured(time=time.astype(float)).clock()
+
+
+def test_a_resonance_seen_by_a_clock_of_few_digits_is_where_it_is():
+    """900 Hz at 30 kHz: the samples are a model's at the exact times, the clock rounds them."""
+    time = np.arange(3000) / 3e4
+    step = np.where(time < 0.01, 0.0, 20.0)
+    ringing = DynamicsModel(2.0 * np.pi * 900.0, 0.02, 5e-7, 0.0, 0.0, 0).deflection(time, step)
+    seen = measured(ringing, step, np.round(time, 6)).bridged()
+    found = identify_dynamics(seen, step, 1)
+    assert found.natural_frequency / (2.0 * np.pi) == pytest.approx(900.0, rel=1e-3)
+    np.testing.assert_allclose(found.deflection(seen.time, step), ringing, atol=2e-8)

@@ -250,6 +250,23 @@ def test_unusable_input_ends_with_code_2_and_says_why(identify, capsys, argument
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("ends", "way"), [([150.0, 0.0], "falls"), ([75.0, -75.0, 0.0], "rises")])
+def test_a_single_cycle_is_refused_for_what_it_lacks(identify, tmp_path, capsys, ends, way):
+    """A triangle up and down from one end, or once around: one branch is left after both ends; two cycles do."""
+    operator = HysteresisParameters((0.0, 5.0, 20.0, 45.0, 80.0), (6e-8, 1.2e-8, 1e-8, 8e-9, 5e-9))
+    for cycles in (1, 2):
+        turns = np.array([0.0, *(ends * cycles)])
+        reached = np.append(0.0, np.cumsum(np.abs(np.diff(turns))))
+        voltage = np.interp(np.arange(0.0, reached[-1], 0.15), reached, turns)
+        noise = np.random.default_rng(3).normal(0.0, 5e-3, voltage.size)
+        deflection = 1e6 * deflection_history(operator, voltage) + noise
+        path = table(tmp_path / f"{cycles}.csv", voltage, deflection, rate=1000.0)
+        assert identify("hysteresis", path) == (2 if cycles == 1 else 0)
+        words = f"has been to both ends it only {way} in the rows"
+        said = capsys.readouterr().err
+        assert (words in said and "record two cycles or more" in said) == (cycles == 1)
+
+
 LOOP = 30.0 * np.sin(2.0 * np.pi * np.arange(2000) / 200.0)  # V
 PAPERS = 1e6 * deflection_history(HysteresisParameters(), LOOP)  # µm
 

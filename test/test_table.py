@@ -119,6 +119,23 @@ def test_a_measurement_comes_back_from_any_shape(tmp_path_factory, shape):
         np.testing.assert_allclose(getattr(found, quantity), values, rtol=1e-12, atol=1e-20)
 
 
+@pytest.mark.parametrize("comment", ["\tComment", ""])
+@pytest.mark.parametrize("end", ["\t", ""])
+def test_labview_names_a_comment_that_no_row_has_and_units_above(tmp_path, comment, end):
+    """As NI's "Specification for the LabVIEW Measurement File" has them: Y_Unit_Label, one for each channel."""
+    path = tmp_path / "a.lvm"
+    text = (
+        (FORMATS / "labview.lvm")
+        .read_text()
+        .replace("Voltage\tDeflection [um]\tComment", f"CH0\tCH1{comment}")
+    )
+    text = text.replace("X0\t", "Y_Unit_Label\tmV\tum\t\nX0\t").replace("\t\n0.", f"{end}\n0.")
+    path.write_text(text)
+    found = read_measurement(path, {"time": "X_Value", "voltage": "CH0", "deflection": "CH1"})
+    np.testing.assert_allclose(found.voltage, 1e-3 * VOLTAGE, atol=1e-12)
+    np.testing.assert_allclose(found.deflection, 0.5e-6 * VOLTAGE, atol=1e-10)
+
+
 DAMAGES = {
     "a word in a cell": lambda rows, k: rows[k].__setitem__(0, "low"),
     "a cell too many": lambda rows, k: rows[k].extend(["7.0", "8.0"]),
@@ -153,10 +170,86 @@ def test_a_damaged_one_is_refused(tmp_path_factory, damage, k, separator):
         ("Voltage (V)", ("Voltage", "V")), ("x [µm]", ("x", "um")), ("disp_nm", ("disp", "nm")),
         ("U / V", ("U", "V")), ("Temp [C]", ("Temp", "degc")), ("V+ [V]", ("V+", "V")),
         ("U (Volts)", ("U", "V")), ("t [seconds]", ("t", "s")), ("plain", ("plain", "")), ("run_2", ("run_2", "")),
+        ("Time (msec)", ("Time", "ms")), ("Time_usec", ("Time", "us")), ("t [µsec]", ("t", "us")),
+        ("voltage (mv)", ("voltage", "mV")), ("U [kv]", ("U", "kV")), ("time in ms", ("time", "ms")),
+        ("Temp C", ("Temp C", "")), ("Torque [Nm]", ("Torque [Nm]", "")), ("V_in", ("V_in", "")),
     ],
 )  # fmt: skip
 def test_names_give_their_units(header, expected):
     assert split_name(header) == expected
+
+
+HEADINGS = ("time (s)", "voltage (V)", "deflection (um)")
+
+
+def write_table(path, headings=HEADINGS, time=lambda k: f"{0.1 * k:.1f}", rows=60):
+    """Write 60 rows 0.1 s apart, voltages of up to 6 V, deflections of 2 µm each further than the one before."""
+    lines = [",".join(headings), *(f"{time(k)},{k % 7},{2 * k}" for k in range(rows))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("place", "heading", "unit"),
+    [
+        (0, "time (jiffies)", "jiffies"), (0, "time_ns", "ns"), (0, "time [MS]", "MS"), (1, "voltage (counts)", "counts"),
+        (1, "voltage_uV", "uV"), (2, "deflection / inch", "inch"), (2, "deflection [Nm]", "Nm"),
+        (2, "deflection mils", "mils"),
+    ],
+)  # fmt: skip
+def test_a_unit_that_is_not_understood_is_refused_until_it_is_said(tmp_path, place, heading, unit):
+    headings = [*HEADINGS[:place], heading, *HEADINGS[place + 1 :]]
+    path = write_table(tmp_path / "a.csv", headings)
+    quantity = ("time", "voltage", "deflection")[place]
+    words = f"is in {unit}, '{quantity}' must be in one of .*as in --{quantity} {place}:"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(path, {quantity: str(place)})
+    said = read_measurement(path, {quantity: f"{place}:{('ms', 'mV', 'nm')[place]}"})
+    assert f"{quantity} = column '{heading}' [{('ms', 'mV', 'nm')[place]}]" in said.description
+    below = tmp_path / "below.csv"
+    units = ["s", "V", "um"]
+    units[place] = unit
+    write_table(below, ["time,voltage,deflection\n" + units[0], *units[1:]])
+    with pytest.raises(MeasurementError, match=f"is in {unit}, '{quantity}' must be in one of"):
+        read_measurement(below)
+
+
+def of_clock(step, form):
+    """Return times that are `step` seconds apart in a form of hours, minutes and seconds."""
+    return lambda k: form.format(h=k * step // 3600, m=k * step // 60 % 60, s=k * step % 60)
+
+
+@pytest.mark.parametrize(
+    ("heading", "column", "form", "step", "taken"),
+    [
+        ("time", None, "{h}:{m:02}:{s:02}", 1, "h:min:s"),
+        ("time", None, "{h}:{m:02}:{s:02}", 600, "h:min:s"),  # beyond 24 h
+        ("time", None, "{m:02}:{s:02}.0", 1, "min:s"),
+        ("time", None, "{m:02}:{s:02}", 30, "min:s"),  # up to minute 29, no hour
+        ("time", "0:min", "{m:02}:{s:02}", 1, "min:s"),
+        ("time [mm:ss]", None, "{m:02}:{s:02}", 1, "min:s"),
+        ("time", "time:h", "{h:02}:{m:02}", 60, "h:min"),
+        ("time (hh:mm)", None, "{h:02}:{m:02}", 60, "h:min"),
+        ("time (UTC)", "0", "2024-05-01 {h:02}:{m:02}", 60, "date"),
+    ],
+)
+def test_clocks_are_read_by_their_parts(tmp_path, heading, column, form, step, taken):
+    path = write_table(tmp_path / "a.csv", (heading, *HEADINGS[1:]), of_clock(step, form))
+    found = read_measurement(path, {"time": column} if column else {})
+    np.testing.assert_allclose(found.time, step * np.arange(60.0))
+    assert f"time = column '{heading}' [{taken}]" in found.description
+
+
+def test_minutes_that_may_be_hours_are_asked_for(tmp_path):
+    """600 rows 00:00 to 09:59, a second apart as a spreadsheet saves them, would be 10 minutes or 10 hours."""
+    path = write_table(
+        tmp_path / "a.csv", ("time", *HEADINGS[1:]), of_clock(1, "{m:02}:{s:02}"), 500
+    )
+    words = "minutes and seconds or hours and minutes: .*--time 0:min or --time 0:h, .*mm:ss"
+    with pytest.raises(MeasurementError, match=words):
+        read_measurement(path)
+    assert read_measurement(path, {"time": "0:min"}).time[-1] == 499.0
+    assert read_measurement(path, {}, sample_time=0.5).time[-1] == 249.5
 
 
 def test_columns_by_number_and_by_a_part_of_the_name(tmp_path):
@@ -188,6 +281,83 @@ def test_a_table_without_names_has_its_columns_in_order(tmp_path):
         read_measurement(path)
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("um", 1e6), ("nm", 1e9), ("mm", 1e3), ("m", 1.0)])
+@pytest.mark.parametrize("gain", [0.44e-6, 0.054e-6, 15e-6])
+def test_a_small_stroke_without_names_is_not_taken_for_a_large_one(tmp_path, gain, unit, scale):
+    """2 V on the paper's finger give 0.9 µm; a PICMA stack P-882.11 6.5 µm/120 V, a bender PL128.10 15 µm/V."""
+    path = tmp_path / "a.txt"
+    path.write_text(
+        "\n".join(f"{k / 10}\t{k % 3}\t{gain * scale * (k % 3):.9f}" for k in range(60))
+    )
+    found = read_measurement(path)
+    assert np.ptp(found.deflection) == pytest.approx(2.0 * gain, rel=0.01)
+    assert "without names: this order and these units assumed" in found.description
+    assert f"deflection = column '2' [{unit}]" in found.description
+
+
+@pytest.mark.parametrize(
+    ("stroke", "voltage", "words"),
+    [
+        (60.0, 2, "spans 60 under 2 V may be in um or nm"),  # of a bender, 30 µm/V, or 30 nm/V of a stack
+        (60.0, 0, "spans 60 may be in um or nm"),
+        (5e3, 1e-3, "spans 5000 under 0.001 V may be in m or mm or um or nm"),  # in none that is known
+    ],
+)  # fmt: skip
+def test_a_stroke_without_names_that_may_have_two_units_is_asked_for(
+    tmp_path, stroke, voltage, words
+):
+    path = tmp_path / "a.txt"
+    path.write_text("".join(f"{k} {voltage * (k % 2)} {stroke * (k % 2)}\n" for k in range(60)))
+    options = "--time 0 --voltage 1 --deflection 2:um"
+    with pytest.raises(MeasurementError, match=f"no names, .*{words}: .* as in {options}"):
+        read_measurement(path)
+    columns = {"time": "0", "voltage": "1", "deflection": "2:nm"}
+    assert np.ptp(read_measurement(path, columns).deflection) == pytest.approx(stroke * 1e-9)
+
+
+@pytest.mark.parametrize("separator", [";", "\t", '","'])
+def test_marks_between_thousands_are_not_taken_for_decimal_ones(tmp_path, separator):
+    """88 µm in nm, 88,200 or 88.200; with a 0,500 or 12.50 anywhere, or decimals in each cell, they are decimals."""
+    path = tmp_path / "a.csv"
+    quote = separator[0] * (len(separator) > 1)
+
+    def write(mark, first, column):
+        rows = [[str(k), first, column(k).replace(",", mark)] for k in range(60)]
+        text = [["time", "voltage (V)", "deflection (nm)"], *rows]
+        path.write_text("".join(f"{quote}{separator.join(row)}{quote}\n" for row in text))
+        return read_measurement(path)
+
+    for mark in ",.":
+        with pytest.raises(MeasurementError, match=f"'1\\{mark}470' is 1470, or has decimals"):
+            write(mark, "5", lambda k: f"{1470 * k:,}")
+    with pytest.raises(MeasurementError, match="'1,000' is 1000, or has decimals"):
+        write(",", "5", lambda k: f"{1000 + k:,}")
+    assert write(",", "0,500", lambda k: f"1,{100 + k}").deflection[-1] == pytest.approx(1.159e-9)
+    assert write(".", "5", lambda k: f"1.{100 + k}").deflection[-1] == pytest.approx(1.159e-9)
+
+
+@pytest.mark.parametrize("number", ["{:.4f}", "{:.3e}", "{:d}"])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_a_row_that_the_end_of_the_file_cuts_is_left_out(tmp_path, number, order):
+    """Wherever the writing stopped: what is read has been written, be the last row whole, cut or left out."""
+    path = tmp_path / "a.csv"
+    rows = [(f"{0.1 * k:.2f}", number.format(100 + k), number.format(500 - k)) for k in range(60)]
+    lines = [
+        ",".join(cells[i] for i in order) for cells in [("time", "voltage", "deflection_nm"), *rows]
+    ]
+    text = "\n".join(lines)
+    last = len(lines[-1])
+    for cut in range(last + 1):
+        path.write_text(text[: len(text) - cut])
+        found = read_measurement(path)
+        count = 60 if cut == 0 else 59
+        assert len(found.time) == count
+        np.testing.assert_allclose(found.voltage, 100.0 + np.arange(count))
+        np.testing.assert_allclose(found.deflection, 1e-9 * (500.0 - np.arange(count)))
+        said = "row 61 left out, where the file ends within a row"
+        assert (said in found.description) == (0 < cut < last)
+
+
 def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     path = tmp_path / "a.csv"
     rows = [f"{0.1 * k:.1f},{k % 7},{2 * k}" for k in range(200)]
@@ -195,6 +365,48 @@ def test_few_empty_cells_are_left_out_and_counted(tmp_path):
     path.write_text("time,voltage,deflection_um\n" + "\n".join(rows) + "\n\n")
     found = read_measurement(path)
     assert len(found.time) == 199 and "1 rows with empty cells left out" in found.description
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "NaN",
+        "nan",
+        "-nan",
+        "#N/A",
+        "N/A",
+        "#NV",
+        "#DIV/0!",
+        "-",
+        "--",
+        "1.#QNAN",
+        "-1.#IND00",
+        "null",
+    ],
+)
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_a_word_for_no_number_is_as_good_as_an_empty_cell(tmp_path, word, place):
+    """As C, NumPy, Excel in English and German, and instruments write it; in each column, in the first row and the last."""
+    path = tmp_path / "a.csv"
+    table = [[f"{0.1 * k:.1f}", f"{k % 7}", f"{2 * k}"] for k in range(400)]
+    rows = [0, 150, 399]
+    for row in rows:
+        table[row][place] = word
+    for names in (["time", "voltage", "deflection_um"], []):
+        path.write_text("".join(",".join(row) + "\n" for row in ([names] if names else []) + table))
+        columns = {} if names else {"time": "0", "voltage": "1", "deflection": "2:um"}
+        found = read_measurement(path, columns)
+        kept = np.delete(np.arange(400), rows)
+        np.testing.assert_allclose(found.time, 0.1 * kept)
+        np.testing.assert_allclose(found.deflection, 2e-6 * kept)
+        assert "3 rows with empty cells left out" in found.description
+
+
+def test_a_row_of_words_for_no_number_has_no_names(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("nan,nan,nan\n" + "".join(f"{k},{k % 7},{2 * k}\n" for k in range(200)))
+    found = read_measurement(path, {"time": "0", "voltage": "1", "deflection": "2:um"})
+    assert len(found.time) == 200
 
 
 @given(st.binary(max_size=400))

@@ -28,20 +28,23 @@ class Array(NamedTuple):
     unit: str = ""
 
 
-def read_vectors(path: Path) -> list[Array]:
-    """Return the longest vectors of numbers in a file of one of READERS; instants become seconds from the first.
+def read_vectors(path: Path) -> list[list[Array]]:
+    """Return the vectors of numbers in a file of one of READERS, those of one length together, the longest first.
 
-    Raises ValueError with what is wrong.
+    Instants become seconds from the first. Raises ValueError with what is wrong.
     """
     try:
         arrays = list(READERS[path.suffix.lower()](path))
     except Exception as error:  # of the library that takes the bytes apart, whatever they are
         raise ValueError(f"cannot be read: {error or type(error).__name__}") from None
-    vectors = [vector for array in arrays for vector in _columns(array)]
-    length = max((v.values.size for v in vectors), default=0)
-    if not length:
+    of_length: dict[int, list[Array]] = {}
+    for array in arrays:
+        for vector in _columns(array):
+            of_length.setdefault(vector.values.size, []).append(vector)
+    of_length.pop(0, None)
+    if not of_length:
         raise ValueError(f"no vectors of numbers; it has {', '.join(a.name for a in arrays)}")
-    return [v for v in vectors if v.values.size == length]
+    return [of_length[length] for length in sorted(of_length, reverse=True)]
 
 
 def _columns(array: Array) -> Iterator[Array]:
@@ -53,9 +56,9 @@ def _columns(array: Array) -> Iterator[Array]:
         return
     values = np.squeeze(values)
     if values.dtype.kind == "M":
-        values = (values - values.ravel()[:1]) / np.timedelta64(1, "s")
+        values, unit = (values - values.ravel()[:1]) / np.timedelta64(1, "s"), "s"
     elif values.dtype.kind == "m":
-        values = values / np.timedelta64(1, "s")
+        values, unit = values / np.timedelta64(1, "s"), "s"
     if values.dtype.kind not in "iuf" or values.ndim not in (1, 2):
         return
     if values.ndim == 1:
@@ -96,7 +99,7 @@ def _hdf5(path: Path) -> Iterator[Array]:
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):
-            said = [item.attrs[key] for key in UNIT_ATTRIBUTES if key in item.attrs]
+            said = [np.ravel(item.attrs[key])[0] for key in UNIT_ATTRIBUTES if key in item.attrs]
             unit = said[0].decode() if said and isinstance(said[0], bytes) else str(*said[:1])
             found.append(Array(name.replace("/", "."), item[()], unit))
 
@@ -107,8 +110,10 @@ def _hdf5(path: Path) -> Iterator[Array]:
 
 def _tdms(path: Path) -> Iterator[Array]:
     for group in _library("nptdms").TdmsFile.read(path).groups():
-        for i, channel in enumerate(group.channels()):
-            if i == 0 and "wf_increment" in channel.properties:  # LabVIEW's waveforms
+        timed: set[int] = set()  # lengths of LabVIEW's waveforms
+        for channel in group.channels():
+            if "wf_increment" in channel.properties and len(channel) not in timed:
+                timed.add(len(channel))
                 yield Array(f"{group.name}.time", channel.time_track(), "s")
             unit = str(channel.properties.get("unit_string", ""))
             yield Array(f"{group.name}.{channel.name}", np.asarray(channel[:]), unit)

@@ -17,6 +17,7 @@ AT_THE_END = 5e-3  # of the stroke: no further from its end, a deflection stays 
 VOLTAGE_AT_THE_END = 0.05  # of its range: a free finger does not stay at an end for so long
 FEWEST_AT_THE_END = 5  # samples
 HUMP = 0.03  # of the stroke, by which a deflection goes on and back while the voltage stays
+SMALLEST_BRANCH = 0.1  # of the range of the voltage
 LARGEST_DRIFT = 0.05  # of the stroke, where there is hardly a loop
 MAINS = (50.0, 60.0, 100.0, 120.0)  # Hz
 SMALLEST_HUM = 2e-3  # of the stroke, amplitude
@@ -175,6 +176,19 @@ def _drift(measurement: Measurement) -> None:
             f"column 'deflection' drifts by {drift * 1e6:.3g} µm from cycle to cycle, the loop is {width * 1e6:.3g} µm "
             "wide: wait until creep and heat are over, or use fewer cycles (--start, --end)",
         )
+
+
+def one_branch(measurement: Measurement, fitted: slice) -> str:
+    """Say that the voltage only rises or only falls in the part that is `fitted`; '' where it does both."""
+    voltage = measurement.voltage[fitted]
+    rise = float(np.max(voltage - np.minimum.accumulate(voltage)))
+    fall = float(np.max(np.maximum.accumulate(voltage) - voltage))
+    if min(rise, fall) > SMALLEST_BRANCH * np.ptp(measurement.voltage):
+        return ""
+    return (
+        f"after the voltage has been to both ends it only {'rises' if rise > fall else 'falls'} in the "
+        f"{_rows(measurement, fitted)} that are fitted, what is held back comes after them: record two cycles or more"
+    )
 
 
 def hum(measurement: Measurement, deviation: NDArray[np.float64]) -> str:

@@ -129,7 +129,8 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
     fitted = slice(first, last)
     if hum := checks.hum(measurement.part(fitted), (measurement.deflection - modelled)[fitted]):
         console.print(f"{arguments.recording}: {hum}", soft_wrap=True)
-    need(str(arguments.recording), fits, "a straight line")
+    reason = checks.one_branch(measurement, slice(first, split))
+    need(str(arguments.recording), fits, "a straight line", reason)
     console.print(
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
         f"smoothness {model.smoothness:g}"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from piezo_control.options import within
 
 QUANTITIES = {  # the units a column may have, the first of them where nothing says which
-    "time": ("s", "ms", "us", "min"),
+    "time": ("s", "ms", "us", "min", "h"),
     "voltage": ("V", "mV", "kV"),
     "deflection": ("m", "mm", "um", "nm"),
     "temperature": ("degc",),

@@ -87,7 +87,7 @@ class DynamicsModel:
     ) -> NDArray[np.float64]:
         """Return the deflection (m) at evenly spaced `time` (s) from rest at drive[0], through `static`."""
         time = np.asarray(time, float)
-        sample_time = time[1] - time[0]
+        sample_time = (time[-1] - time[0]) / (time.size - 1)
         rate = 2.0 * math.pi * self.bandwidth_hz * sample_time
         held = _behind(np.asarray(drive, float), rate, static)
         first = 1.0 - sum(mode.share for mode in self.modes)

@@ -77,12 +77,16 @@ def straight(
     return scaled @ np.linalg.lstsq(scaled[fitted], measured[fitted], rcond=None)[0]
 
 
-def need(source: str, fits: dict[str, FitQuality], less: str) -> None:
-    """Raise MeasurementError for a fit that explains too little, or hardly more than `less` of a model."""
+def need(source: str, fits: dict[str, FitQuality], less: str, reason: str = "") -> None:
+    """Raise MeasurementError for a fit that explains too little, or hardly more than `less` of a model.
+
+    It says the `reason`, where there is one, else what to look for.
+    """
     good = 0.01 * GOOD_RMS_PERCENT * max(fit.stroke for fit in fits.values())
     for part, fit in fits.items():
         said = f"{part}: rms {fit.rms_percent:.1f} % of the stroke"
-        advice = "nothing written; look for outliers, a reversed sign, wrong columns, or an actuator of another kind"
+        look = "look for outliers, a reversed sign, wrong columns, or an actuator of another kind"
+        advice = f"nothing written; {reason or look}"
         if not fit.rms_percent <= LARGEST_RMS_PERCENT:
             raise MeasurementError(
                 f"{source}: the fit explains too little ({said}, must be at most {LARGEST_RMS_PERCENT:g} %), {advice}"

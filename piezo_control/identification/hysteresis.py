@@ -287,7 +287,7 @@ class _Problem:
         full = np.append(x, -1.0)
         equations = self.equations(lag)
         free = x > self.lowest()
-        step = self.measurement.sample_time
+        step = float(np.median(np.diff(self.measurement.time)))
         by_lag = (self.equations(lag + step) - self.equations(lag - step)) @ full / (2.0 * step)
         jacobian = np.column_stack((equations[:, :-1] * free, by_lag * searched))
         rows = np.sqrt(len(equations)) * penalty[:, :-1] * free

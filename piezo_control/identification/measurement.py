@@ -23,6 +23,9 @@ from piezo_control.recording import recording
 
 SHORTEST = 50  # samples
 LARGEST_JITTER = 0.02  # of the sample time, standard deviation
+SMALLEST_GAP = (
+    1.75  # of the median step: above 5/3, which a clock of few digits shows of even sampling
+)
 
 
 class MeasurementError(ValueError):
@@ -89,13 +92,24 @@ class Measurement:
 
     @property
     def sample_time(self) -> float:
-        """Time from sample to sample (s), the median."""
-        return float(np.median(np.diff(self.time)))
+        """Time from sample to sample (s): the mean, without gaps; the median is a multiple of the clock's digit."""
+        return _step(self.time)
+
+    def _is_even(self) -> bool:
+        """Say whether all samples are within a digit of the clock where even sampling, with gaps, has them."""
+        step = self.sample_time
+        digit = np.diff(np.unique(np.round(np.diff(self.time) / step, 6))).min(initial=1.0)
+        off = (self.time - self.time[0]) / step - places(self.time)
+        return bool(np.abs(off).max() <= digit)
 
     def need_even_sampling(self) -> None:
-        """Raise MeasurementError at the first gap: a step that differs from the sample time by 1 %."""
+        """Raise MeasurementError at the first gap: a step that differs from the sample time by 1 %.
+
+        Where only the clock's digits make the steps differ, they may.
+        """
         steps = np.diff(self.time)
-        uneven = np.flatnonzero(np.abs(steps - self.sample_time) > 0.01 * self.sample_time)
+        allowed = 0.5 if self._is_even() else 0.01
+        uneven = np.flatnonzero(np.abs(steps - self.sample_time) > allowed * self.sample_time)
         if len(uneven):
             i = uneven[0]
             raise self.error(
@@ -111,21 +125,22 @@ class Measurement:
         Raises MeasurementError at the first gap when more is missing than may be.
         """
         steps = np.diff(self.time)
-        gaps = np.flatnonzero(steps > 1.5 * self.sample_time)
+        gaps = np.flatnonzero(_are_gaps(steps))
         missing = int(np.sum(np.round(steps[gaps] / self.sample_time) - 1))
         said = []
         if missing:
             lost = f"{missing:,} rows are missing in {gaps.size} gaps"
             if missing > LARGEST_MISSING_SHARE * (steps.size + missing):
                 text = f"{steps[gaps[0]]:.4g} s after the row before, rows come every {self.sample_time:.4g} s: {lost}"
-                raise self.error("time", int(gaps[0]) + 1, f"{text}; use a part without them")
+                text += "; use a part without them"
+                if np.ptp(steps) < 1.01 * self.sample_time:
+                    text += f", or where the clock is coarse, --sample-rate {1.0 / np.mean(steps):.5g} in its place"
+                raise self.error("time", int(gaps[0]) + 1, text)
             said.append(f"{lost}, the first before row {self.rows[gaps[0] + 1]}")
         even = np.delete(steps, gaps) / self.sample_time
-        if np.std(even) > LARGEST_JITTER:
+        if np.std(even) > LARGEST_JITTER and not self._is_even():
             worst = int(
-                np.argmax(
-                    np.abs(np.where(steps > 1.5 * self.sample_time, 0.0, steps - self.sample_time))
-                )
+                np.argmax(np.abs(np.where(_are_gaps(steps), 0.0, steps - self.sample_time)))
             )
             said.append(
                 f"the time between rows varies by {100.0 * np.std(even):.2g} %, most before row {self.rows[worst + 1]}; "
@@ -135,7 +150,7 @@ class Measurement:
 
     def bridged(self) -> Measurement:
         """Return the measurement with straight lines across what few rows are missing; as it is, if none are."""
-        place = np.round((self.time - self.time[0]) / self.sample_time)
+        place = places(self.time)
         if place[-1] + 1 == len(place) or np.any(np.diff(place) < 1.0):
             return self
         whole = np.arange(place[-1] + 1)
@@ -144,6 +159,8 @@ class Measurement:
             return None if values is None else np.interp(whole, place, values)
 
         columns: dict[str, Any] = {name: filled(getattr(self, name)) for name in QUANTITIES}
+        if self._is_even():
+            columns["time"] = self.time[0] + self.sample_time * whole
         rows = self.rows[np.searchsorted(place, whole)]
         return replace(self, **columns, rows=rows)
 
@@ -154,6 +171,23 @@ class Measurement:
             for name in (*QUANTITIES, "rows")
         }
         return replace(self, **cut)
+
+
+def _are_gaps(steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return steps > SMALLEST_GAP * np.median(steps)
+
+
+def _step(time: NDArray[np.float64]) -> float:
+    steps = np.diff(time)
+    return float(np.mean(steps[~_are_gaps(steps)]))
+
+
+def places(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return which sample of even sampling each `time` (s) is, from 0; what is missing is passed over.
+
+    Each step is rounded by itself: over a long recording, the sample time is not known well enough.
+    """
+    return np.concatenate(([0.0], np.cumsum(np.round(np.diff(time) / _step(time)))))
 
 
 def read_measurement(

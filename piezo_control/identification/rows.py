@@ -16,9 +16,12 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from piezo_control.identification.units import UNITS, split_name, unit_of
+from piezo_control.identification.units import UNITS, said_unit, unit_of
 
-COMMENTS = ("#", "%")
+MISSING = re.compile(r"(?i)|-+|-?nan|-?1\.#(ind|qnan)\w*|n/?a|null|none|#(n/a|nv|[a-z]+/?0?!)")
+"""What programs write for no number; Excel's begin like a comment."""
+COMMENT = re.compile(r"(?i)\s*(#(?!n/a|nv\b|\w+/?0?!)|%)[#%]*")
+NUMBER = re.compile(r"[-+−]?[\d.,]*\d[.,]?([eEdD][-+]?\d+)?")
 JUDGED = 50  # rows at the end, which have numbers
 
 
@@ -34,7 +37,7 @@ class Layout(NamedTuple):
     """What is where: rows of numbers, as wide as there are names."""
 
     names: list[str]  # '0', '1', … for a table without any
-    units: list[str]  # '' where none is said
+    units: list[str]  # '' where none is said, the word that is said where it is none of UNITS
     rows: list[Row]
     decimal: str
     above: int  # rows above the names
@@ -45,24 +48,41 @@ def read_rows(data: bytes) -> tuple[list[Row], str]:
 
     Raises ValueError for what is no text.
     """
-    lines = [
-        (number, line) for number, line in enumerate(_decode(data).splitlines(), 1) if line.strip()
-    ]
-    written = [line for _, line in lines if not line.lstrip().startswith(COMMENTS)]
+    text = _decode(data)
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    written = [line for _, line in lines if not COMMENT.match(line)]
     if not written:
         return [], ""
     votes = Counter(map(_separator, written[-JUDGED:]))
     separator = votes.most_common(1)[0][0]
     rows = []
     for number, line in lines:
-        comment = line.lstrip().startswith(COMMENTS)
-        if comment:
-            line = line.lstrip().lstrip("".join(COMMENTS))
-        cells = _split(line, separator)
+        comment = COMMENT.match(line)
+        cells = _split(line[comment.end() :] if comment else line, separator)
         if any(cells):
-            rows.append(Row(number, cells, comment))
+            rows.append(Row(number, cells, bool(comment)))
     spelled = {"\t": "tabs", " ": "blanks"}.get(separator, f"'{separator}'")
-    return rows, f"separated by {spelled}"
+    form = f"separated by {spelled}"
+    is_open = rows and not rows[-1].comment and not text.endswith(("\n", "\r"))
+    if is_open and _is_cut([row.cells for row in rows if not row.comment]):
+        form += f", row {rows.pop().number} left out, where the file ends within a row"
+    return rows, form
+
+
+def _is_cut(rows: list[list[str]]) -> bool:
+    """Tell whether the last row has fewer cells than most, or a last number of fewer digits than all others."""
+    *others, last = rows
+    width = Counter(map(len, others)).most_common(1)[0][0] if others else 0
+    numbers = [
+        cells[-1] for cells in others if len(cells) == len(last) and NUMBER.fullmatch(cells[-1])
+    ]
+    marked = any(re.search("[.,]", cell) for cell in numbers)
+
+    def digits(cell: str) -> int:  # with what is behind them, as an exponent
+        parts = re.split("[.,]", cell)
+        return len(parts[-1]) if len(parts) > 1 or not marked else 0
+
+    return len(last) < width or digits(last[-1]) < min(map(digits, numbers), default=0)
 
 
 def _decode(data: bytes) -> str:
@@ -140,12 +160,13 @@ def layout(rows: list[Row]) -> Layout:
     numeric = [i for i in range(width) if 2 * sum(vote[i] for vote in votes) > len(votes)]
 
     def fits(row: Row) -> bool:
-        given = [i for i in numeric if i < len(row.cells) and row.cells[i]]
+        given = [i for i in numeric if i < len(row.cells) and not MISSING.fullmatch(row.cells[i])]
         known = _are_numbers(row.cells, decimal)
         return not row.comment and bool(given) and all(known[i] for i in given)
 
     def of_words(row: Row) -> bool:
-        return not any(_are_numbers(row.cells, decimal))
+        is_said = not all(map(MISSING.fullmatch, row.cells))
+        return is_said and not any(_are_numbers(row.cells, decimal))
 
     first = next((i for i, row in enumerate(rows) if fits(row)), len(rows))
     at = next(
@@ -160,11 +181,18 @@ def layout(rows: list[Row]) -> Layout:
     if at >= 0 and not (_length(rows[at].cells) == 1 < width):
         names, units, at = _named(rows, at, width)
         filled = max(map(_length, shown))
+        if (
+            len(names) > filled and names[-1].lower() == "comment"
+        ):  # of LabVIEW, mostly without cells
+            names, units = names[:-1], units[:-1]
         if not filled <= len(names) <= width:
             raise ValueError(
                 f"row {rows[at].number} has {len(names)} names, the rows below it have {filled} cells: which is "
                 "which cannot be known; make them equally many"
             )
+        labels = [row.cells[1:] for row in rows[:at] if row.cells[0] == "Y_Unit_Label"]  # LabVIEW's
+        said = ["", *(labels or [[]])[-1], *[""] * len(units)]
+        units = [unit or unit_of(label) for unit, label in zip(units, said)]
         names, units = ((entries + [""] * width)[:width] for entries in (names, units))
     for row in below:
         if any(row.cells[width:]):
@@ -172,6 +200,7 @@ def layout(rows: list[Row]) -> Layout:
                 f"row {row.number} has {len(row.cells)} cells, must have at most {width}"
             )
     whole = [Row(row.number, (row.cells + [""] * width)[:width]) for row in below]
+    _refuse_thousands(whole, decimal)
     return Layout(names, units, whole, decimal, sum(not row.comment for row in rows[: max(at, 0)]))
 
 
@@ -183,6 +212,27 @@ def _decimal(shown: list[list[str]]) -> str:
     return "," if commas and not points else "."
 
 
+def _refuse_thousands(rows: list[Row], decimal: str) -> None:
+    """Raise ValueError where what is taken for a decimal mark may as well be between thousands.
+
+    Both have three digits behind them. A decimal comma is known by any number of the table that cannot be thousands,
+    as 0,123; a decimal point by every number of the column having one.
+    """
+    thousands = re.compile(rf"[-+−]?[1-9]\d{{0,2}}([{decimal}]\d{{3}})+")
+    doubtful, known = "", False
+    for column in zip(*(row.cells for row in rows)):
+        marked = [cell for cell in column if decimal in cell]
+        if not all(thousands.fullmatch(cell) for cell in marked):
+            known = decimal == ","
+        elif marked and (decimal == "," or any(c.lstrip("-+−").isdigit() for c in column)):
+            doubtful = marked[0]
+    if doubtful and not known:
+        raise ValueError(
+            f"'{doubtful}' is {doubtful.replace(decimal, '')}, or has decimals: numbers with three digits behind each "
+            f"'{decimal}' may be either; write them without marks between thousands, decimals with more digits"
+        )
+
+
 def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], int]:
     """Return names, units, and the index of the row of names, of words in row `at`: names, or units below them."""
     words = rows[at].cells[: _length(rows[at].cells)]
@@ -191,8 +241,8 @@ def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], 
     if at and not rows[at - 1].comment and 2 * sum(given) >= len(given):
         names = rows[at - 1].cells[: _length(rows[at - 1].cells)]
         told += [""] * len(names)
-        return names, [u if u in UNITS else split_name(n)[1] for u, n in zip(told, names)], at - 1
-    return words, [split_name(word)[1] for word in words], at
+        return names, [unit or said_unit(name) for unit, name in zip(told, names)], at - 1
+    return words, [said_unit(word) for word in words], at
 
 
 def _length(cells: list[str]) -> int:

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
 from piezo_control.identification.arrays import READERS, absent, read_vectors
-from piezo_control.identification.rows import Row, layout, numbered, read_rows, with_points
-from piezo_control.identification.units import UNITS, split_name, unit_of
+from piezo_control.identification.rows import MISSING, Row, layout, numbered, read_rows, with_points
+from piezo_control.identification.units import UNITS, said_unit, split_name, unit_of
 from piezo_control.safety import LARGEST_DEFLECTION
 
 LARGEST_MISSING_SHARE = 0.01  # of the rows
+GAINS = 0.02e-6, 50e-6  # m/V, of a small stack without a lever, and of a bender
 
 
 class TableError(ValueError):
@@ -34,43 +36,67 @@ class Table:
 
     path: Path
     headers: list[str]  # '0', '1', … for a file without a line of names
-    units: list[str]  # '' where the file says none
+    units: list[str]  # '' where the file says none, its word where that is none of UNITS
     cells: pd.DataFrame
     rows: NDArray[np.int64]
     decimal: str = "."
     form: str = ""
+    others: list[str] = field(default_factory=list)  # names of what is not as long
+
+    @property
+    def contents(self) -> str:
+        """What can be chosen from, for people."""
+        others = f"; not as long: {', '.join(self.others)}" if self.others else ""
+        return ", ".join(self.headers) + others
+
+    def has(self, wanted: Mapping[str, str | None]) -> bool:
+        """Tell whether there are columns of all `wanted` quantities."""
+        return all(
+            self._index(self._parts(column, quantity)[0], quantity, exact=column is None)
+            is not None
+            for quantity, column in wanted.items()
+        )
 
     def find(
         self, quantity: str, wanted: str | None, units: tuple[str, ...]
-    ) -> tuple[int, str] | None:
-        """Return index and unit of the column of a `quantity`, None when there is none.
+    ) -> tuple[int, str, NDArray[np.float64]] | None:
+        """Return index, unit and values (SI) of the column of a `quantity`, None when there is none.
 
         `wanted` is NAME, NUMBER or a part of the name that only one column has, with ':UNIT' behind it where
         the file does not say; without it the quantity is looked for under its own name. The first of
-        `units` holds where nothing says another one. Raises TableError for what is not there.
+        `units` holds where nothing says another one. Raises TableError for what is not there, and for a unit that is not understood.
         """
-        name, _, unit = (wanted or quantity).rpartition(":") if ":" in (wanted or "") else (
-            wanted or quantity, "", "",
-        )  # fmt: skip
+        name, unit = self._parts(wanted, quantity)
         if unit and unit_of(unit) not in units:
             raise TableError(
                 f"column '{wanted}' for '{quantity}': unit '{unit}' must be one of {', '.join(units)}"
             )
-        index = self._index(name or quantity, quantity, exact=wanted is None)
+        index = self._index(name, quantity, exact=wanted is None)
         if index is None:
             if wanted is None:
                 return None
             raise TableError(
-                f"{self.path}: no column '{name}' for '{quantity}'; the file has "
-                f"{', '.join(self.headers)}"
+                f"{self.path}: no column '{name}' for '{quantity}'; the file has {self.contents}"
             )
-        unit = unit_of(unit) or self.units[index] or units[0]
-        if unit not in units:
+        unit = unit_of(unit) or self.units[index]
+        if quantity == "time" and (clock := self._clock(index, unit)):
+            return index, *clock
+        if (unit := unit or units[0]) not in units:
+            option = f"--{quantity.replace('_', '-')} {index}:{units[0]}"
             raise TableError(
                 f"{self.path}: column '{self.headers[index]}' is in {unit}, '{quantity}' must be in one of "
-                f"{', '.join(units)}"
+                f"{', '.join(units)}; where '{unit}' is wrong or no unit, say the unit, as in {option}"
             )
-        return index, unit
+        return index, unit, self.numbers(index) * UNITS[unit]
+
+    def _parts(self, wanted: str | None, quantity: str) -> tuple[str, str]:
+        """Return the name and the unit in NAME or NAME:UNIT; some names have a colon."""
+        name, colon, unit = (wanted or "").rpartition(":")
+        return (
+            (name or quantity, unit)
+            if colon and wanted not in self.headers
+            else (wanted or quantity, "")
+        )
 
     def _index(self, name: str, quantity: str, exact: bool) -> int | None:
         def plain(text: str) -> str:
@@ -103,32 +129,58 @@ class Table:
         return found[0]
 
     def numbers(self, index: int) -> NDArray[np.float64]:
-        """Return a column as numbers, NaN where a cell is empty; dates become seconds since the first.
+        """Return a column as numbers, NaN where a cell is empty or says that there is none.
 
         Raises TableError for the first cell that is no number.
         """
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
-        text = plain = column
-        written = (text != "").to_numpy()
-        values = pd.to_numeric(text, errors="coerce").to_numpy(float)
-        if np.any(np.isnan(values) & written):
-            plain = with_points(text, self.decimal)
+        values = pd.to_numeric(column, errors="coerce").to_numpy(float)
+        unread = np.isnan(values) & (column != "").to_numpy()
+        if unread.any():
+            plain = with_points(column, self.decimal)
             values = pd.to_numeric(plain, errors="coerce").to_numpy(float)
-        # pandas reads 'nan' and an empty cell alike; what was written as no number is an error.
-        unread = np.isnan(values) & written
-        if unread.size and unread.all():
-            dates = pd.to_datetime(plain, errors="coerce", format="mixed")
-            if dates.notna().all():
-                return (dates - dates.iloc[0]).dt.total_seconds().to_numpy(float)
+            unread = np.isnan(values) & ~column.str.fullmatch(MISSING).to_numpy(bool)
         if unread.any():
             row = int(np.flatnonzero(unread)[0])
             raise TableError(
                 f"{self.path}: column '{self.headers[index]}', row {self.rows[row]} is "
-                f"'{text.iloc[row]}', must be a finite number"
+                f"'{column.iloc[row]}', must be a finite number"
             )
         return values
+
+    def _clock(self, index: int, unit: str) -> tuple[str, NDArray[np.float64]] | None:
+        """Return how a column writes instants, and these in seconds since the first; None for numbers.
+
+        Raises TableError for times that may be minutes and seconds or hours and minutes, unless `unit` says which.
+        """
+        column = self.cells.iloc[:, index]
+        if column.dtype != object:
+            return None
+        text = with_points(column[~column.str.fullmatch(MISSING)], self.decimal)
+        if pd.to_numeric(text.iloc[:1], errors="coerce").notna().any() or text.empty:
+            return None
+        parts = text.str.extract(r"^(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)$").astype(float)
+        first, second = parts[1], parts[2]
+        if second.isna().any():
+            dates = pd.to_datetime(text, errors="coerce", format="mixed")
+            if dates.isna().any():
+                return None
+            form, seconds = "date", (dates - dates.iloc[0]).dt.total_seconds()
+        elif parts[0].notna().any():
+            form, seconds = "h:min:s", 3600.0 * parts[0].fillna(0.0) + 60.0 * first + second
+        elif unit == "min" or first.max() >= 24.0 or text.str.contains(".", regex=False).any():
+            form, seconds = "min:s", 60.0 * first + second
+        elif unit == "h":
+            form, seconds = "h:min", 3600.0 * first + 60.0 * second
+        else:
+            raise TableError(
+                f"{self.path}: column '{self.headers[index]}' has times as '{text.iloc[-1]}', which are minutes and "
+                "seconds or hours and minutes: say the unit before the colon, as in "
+                f"--time {index}:min or --time {index}:h, or in the heading, as in [mm:ss] or [hh:mm]"
+            )
+        return form, (seconds - seconds.iloc[0]).reindex(column.index).to_numpy(float)
 
 
 @dataclass(frozen=True)
@@ -161,34 +213,40 @@ def read_columns(
     Rows in which a cell that is needed is empty are left out, if they are few. Raises TableError, naming file,
     column and row.
     """
-    table = read_table(path)
+    wanted = ["time", *needed] if sample_time is None else needed
+    table = read_table(path, {quantity: columns.get(quantity) for quantity in wanted})
     if table.headers == numbered(len(table.headers)) and not columns:
-        wanted = ["time", *needed] if sample_time is None else needed
         columns = _in_order(table, wanted, quantities)
-    found = {q: table.find(q, columns.get(q), units) for q, units in quantities.items()}
-    if sample_time is not None:
-        found["time"] = None
-    has = f"the file has {', '.join(table.headers)}: say which column it is"
+        table.form += ", without names: this order and these units assumed" if columns else ""
+    found = {
+        quantity: table.find(quantity, columns.get(quantity), units)
+        for quantity, units in quantities.items()
+        if quantity != "time" or sample_time is None
+    }
+    has = f"the file has {table.contents}: say which column it is"
     for quantity in needed:
         if found[quantity] is None:
             raise TableError(f"{path}: no column for '{quantity}'; {has}, as in --{quantity} 1")
-    if found["time"] is None and sample_time is None:
+    if sample_time is None and found["time"] is None:
         raise TableError(f"{path}: no column for 'time' and no sample time given; {has}")
     places = {quantity: place for quantity, place in found.items() if place}
-    of_column = {index: quantity for quantity, (index, _) in places.items()}
-    for quantity, (index, _) in places.items():
+    of_column = {index: quantity for quantity, (index, *_) in places.items()}
+    for quantity, (index, *_) in places.items():
         if of_column[index] != quantity:
             raise TableError(
                 f"{path}: column '{table.headers[index]}' cannot be both '{quantity}' and '{of_column[index]}'"
             )
-    values = {q: table.numbers(index) * UNITS[unit] for q, (index, unit) in places.items()}
+    values = {quantity: si for quantity, (*_, si) in places.items()}
     if sample_time is not None:
         values["time"] = sample_time * np.arange(len(table.rows))
     empty = np.any([np.isnan(column) for column in values.values()], axis=0)
     if empty.sum() > LARGEST_MISSING_SHARE * empty.size:
+        row = int(np.argmax(empty))
+        index = next(i for q, (i, *_) in places.items() if np.isnan(values[q][row]))
         raise TableError(
-            f"{path}: {empty.sum()} of {empty.size} rows have an empty cell in a column that is needed, the "
-            f"first is row {table.rows[empty][0]}; at most {LARGEST_MISSING_SHARE:.0%} may"
+            f"{path}: column '{table.headers[index]}', row {table.rows[row]} is '{table.cells.iloc[row, index]}', must "
+            f"be a finite number: {empty.sum()} of {empty.size} rows have an empty cell or no number in a column that "
+            f"is needed, the first is row {table.rows[row]}; at most {LARGEST_MISSING_SHARE:.0%} may"
         )
     stroke = (
         float(np.ptp(values["deflection"][~empty]))
@@ -200,7 +258,7 @@ def read_columns(
             f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
             "unit, as in --deflection COLUMN:um"
         )
-    words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit) in places.items()]
+    words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit, _) in places.items()]
     if sample_time is not None:
         words.insert(0, f"time = rows {sample_time:g} s apart")
     left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
@@ -216,24 +274,47 @@ def _in_order(
 ) -> dict[str, str]:
     """Return where the `wanted` quantities are in a table without names: in this order, if no column is left.
 
-    A deflection is in the largest unit in which a finger moves that far.
+    A deflection is in the unit in which a finger moves that far under such voltages. Raises TableError where that
+    is not just one.
     """
     filled = np.flatnonzero((table.cells != "").any())
     if len(filled) != len(wanted):
         return {}
     places = {quantity: str(i) for quantity, i in zip(wanted, filled)}
     if "deflection" in places:
-        stroke = np.ptp(np.nan_to_num(table.numbers(int(places["deflection"]))))
-        possible = [u for u in quantities["deflection"] if stroke * UNITS[u] <= LARGEST_DEFLECTION]
-        places["deflection"] += f":{possible[0]}" if possible else ""
+        span = {
+            q: float(np.ptp(np.nan_to_num(table.numbers(int(i)))))
+            for q, i in places.items()
+            if q != "time"
+        }
+        stroke, voltage = span["deflection"], span.get("voltage", 0.0)
+        possible = [
+            unit
+            for unit in quantities["deflection"]
+            if stroke * UNITS[unit] <= LARGEST_DEFLECTION
+            and (not voltage or GAINS[0] <= stroke * UNITS[unit] / voltage <= GAINS[1])
+        ]
+        if len(possible) != 1:
+            under = f" under {voltage:g} V" if voltage else ""
+            options = " ".join(
+                f"--{quantity.replace('_', '-')} {i}" for quantity, i in places.items()
+            )
+            raise TableError(
+                f"{table.path}: no names, and a deflection that spans {stroke:g}{under} may be in "
+                f"{' or '.join(possible or quantities['deflection'])}: say its unit, as in {options}:um"
+            )
+        places["deflection"] += f":{possible[0]}"
     return places
 
 
-def read_table(path: str | Path) -> Table:
-    """Read a table of numbers; raises TableError naming what cannot be read."""
+def read_table(path: str | Path, wanted: Mapping[str, str | None] = MappingProxyType({})) -> Table:
+    """Read a table of numbers; raises TableError naming what cannot be read.
+
+    Of vectors the longest are taken, or the longest among which the `wanted` quantities are, see :meth:`Table.find`.
+    """
     path = Path(path)
     if path.suffix.lower() in READERS:
-        return _read_vectors(path)
+        return _read_vectors(path, wanted)
     if path.suffix.lower() == ".xlsx":
         return _read_sheet(path)
     try:
@@ -261,17 +342,26 @@ def _table(path: Path, rows: list[Row], form: str) -> Table:
     return Table(path, found.names, found.units, cells, numbers, found.decimal, form)
 
 
-def _read_vectors(path: Path) -> Table:
+def _read_vectors(path: Path, wanted: Mapping[str, str | None]) -> Table:
     try:
-        vectors = read_vectors(path)
+        lengths = read_vectors(path)
     except ValueError as error:
         raise TableError(f"{path}: {error}") from None
-    headers = [vector.name for vector in vectors]
-    told = [unit_of(vector.unit) for vector in vectors]
-    units = [u if u in UNITS else split_name(header)[1] for u, header in zip(told, headers)]
-    # Not by name: two of them may have the same.
-    cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
-    return Table(path, headers, units, cells, np.arange(len(cells)), form="vectors by name")
+    tables = []
+    for vectors in lengths:
+        headers = [vector.name for vector in vectors]
+        told = [unit_of(vector.unit) for vector in vectors]
+        units = [unit or said_unit(header) for unit, header in zip(told, headers)]
+        # Not by name: two of them may have the same.
+        cells = pd.DataFrame(dict(enumerate(vector.values for vector in vectors)))
+        others = [other.name for others in lengths if others is not vectors for other in others]
+        form = "vectors by name" + (
+            f", {len(others)} of other lengths passed over" if others else ""
+        )
+        tables.append(
+            Table(path, headers, units, cells, np.arange(len(cells)), form=form, others=others)
+        )
+    return next((table for table in tables if table.has(wanted)), tables[0])
 
 
 def _read_sheet(path: Path) -> Table:

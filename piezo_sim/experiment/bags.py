@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from piezo_control.identification.columns import LOOP
-from piezo_control.identification.measurement import is_bag
+from piezo_control.identification.measurement import is_bag, places
 from piezo_control.identification.table import TableError, read_columns
 from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
@@ -75,7 +75,7 @@ def _read_table(
         row = f"row {found.rows[late[0] + 1]}: the time" if late.size else "one row or none: a run"
         raise BagError(f"{path}: {row} must go on; --sample-rate takes the place of its column")
     since = time - time[0]
-    number = np.round(since / np.median(np.diff(time))).astype(np.int64)
+    number = places(time).astype(np.int64)
     if np.any(np.diff(number) < 1):
         number = np.arange(time.size)  # samples at odd instants: none can be called missing
     signals = (f.name for f in fields(Recording) if f.name not in ("number", "time"))
