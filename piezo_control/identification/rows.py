@@ -181,9 +181,7 @@ def layout(rows: list[Row]) -> Layout:
     if at >= 0 and not (_length(rows[at].cells) == 1 < width):
         names, units, at = _named(rows, at, width)
         filled = max(map(_length, shown))
-        if (
-            len(names) > filled and names[-1].lower() == "comment"
-        ):  # of LabVIEW, mostly without cells
+        if len(names) > filled and names[-1].lower() == "comment":  # LabVIEW's, without cells
             names, units = names[:-1], units[:-1]
         if not filled <= len(names) <= width:
             raise ValueError(
