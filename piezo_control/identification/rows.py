@@ -219,11 +219,11 @@ def _refuse_thousands(rows: list[Row], decimal: str) -> None:
     thousands = re.compile(rf"[-+−]?[1-9]\d{{0,2}}([{decimal}]\d{{3}})+")
     doubtful, known = "", False
     for column in zip(*(row.cells for row in rows)):
-        marked = [cell for cell in column if decimal in cell]
-        if not all(thousands.fullmatch(cell) for cell in marked):
+        marked = next((cell for cell in column if decimal in cell), "")
+        if not all(thousands.fullmatch(cell) for cell in column if decimal in cell):
             known = decimal == ","
         elif marked and (decimal == "," or any(c.lstrip("-+−").isdigit() for c in column)):
-            doubtful = marked[0]
+            doubtful = marked
     if doubtful and not known:
         raise ValueError(
             f"'{doubtful}' is {doubtful.replace(decimal, '')}, or has decimals: numbers with three digits behind each "

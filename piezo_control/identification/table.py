@@ -161,9 +161,11 @@ class Table:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return None
-        text = with_points(column[~column.str.fullmatch(MISSING)], self.decimal)
-        if pd.to_numeric(text.iloc[:1], errors="coerce").notna().any() or text.empty:
+        written = column[~column.str.fullmatch(MISSING)]
+        begin = with_points(written.iloc[:1], self.decimal)
+        if written.empty or pd.to_numeric(begin, errors="coerce").notna().any():
             return None
+        text = with_points(written, self.decimal)
         parts = text.str.extract(r"^(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)$").astype(float)
         first, second = parts[1], parts[2]
         if second.isna().any():
