@@ -173,9 +173,18 @@ def test_even_sampling_with_few_digits_of_time_is_even():
         whole = few.bridged()
         np.testing.assert_allclose(whole.time, time, atol=1.1e-6)
         whole.need_even_sampling()
+        shifted = 1e5 + time  # where a double has digits of 15 ps
+        measured(time=shifted).need_even_sampling()
         late = time + np.where(np.arange(TIME.size) == 700, 4e-6, 0.0)
         with pytest.raises(MeasurementError, match=f"--sample-rate {rate:.0f}"):
             measured(time=late).need_even_sampling()
+
+
+def test_a_late_row_is_no_digit_of_the_clock():
+    """One step of 7 ms among those of 5 ms: no clock of 2 ms, which has no 5."""
+    late = measured(time=TIME + np.where(np.arange(TIME.size) > 700, 2e-3, 0.0))
+    with pytest.raises(MeasurementError, match="row 703 is .*: 0.007 s after the row before"):
+        late.need_even_sampling()
 
 
 def test_a_clock_as_coarse_as_the_rows_may_be_replaced(tmp_path):

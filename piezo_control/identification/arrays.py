@@ -99,7 +99,9 @@ def _hdf5(path: Path) -> Iterator[Array]:
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and not name.startswith("#"):
-            said = [np.ravel(item.attrs[key])[0] for key in UNIT_ATTRIBUTES if key in item.attrs]
+            said = [
+                [*np.ravel(item.attrs[key]), ""][0] for key in UNIT_ATTRIBUTES if key in item.attrs
+            ]
             unit = said[0].decode() if said and isinstance(said[0], bytes) else str(*said[:1])
             found.append(Array(name.replace("/", "."), item[()], unit))
 

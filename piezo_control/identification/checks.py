@@ -187,7 +187,8 @@ def one_branch(measurement: Measurement, fitted: slice) -> str:
         return ""
     return (
         f"after the voltage has been to both ends it only {'rises' if rise > fall else 'falls'} in the "
-        f"{_rows(measurement, fitted)} that are fitted, what is held back comes after them: record two cycles or more"
+        f"{_rows(measurement, fitted)} that are fitted, which say little of the other branch and of what comes after "
+        "them: record two cycles or more"
     )
 
 

@@ -23,9 +23,7 @@ from piezo_control.recording import recording
 
 SHORTEST = 50  # samples
 LARGEST_JITTER = 0.02  # of the sample time, standard deviation
-SMALLEST_GAP = (
-    1.75  # of the median step: above 5/3, which a clock of few digits shows of even sampling
-)
+SMALLEST_GAP = 1.75  # of the median step; a clock of few digits steps by 5/3 of it at most
 
 
 class MeasurementError(ValueError):
@@ -97,10 +95,13 @@ class Measurement:
 
     def _is_even(self) -> bool:
         """Say whether all samples are within a digit of the clock where even sampling, with gaps, has them."""
-        step = self.sample_time
-        digit = np.diff(np.unique(np.round(np.diff(self.time) / step, 6))).min(initial=1.0)
-        off = (self.time - self.time[0]) / step - places(self.time)
-        return bool(np.abs(off).max() <= digit)
+        steps, noise = np.diff(self.time), 8.0 * np.spacing(np.abs(self.time).max())
+        apart = np.diff(np.sort(steps))
+        digit = apart[apart > noise].min(initial=self.sample_time)
+        if np.any(np.abs(steps - digit * np.round(steps / digit)) > 0.01 * digit):
+            return False
+        off = self.time - self.time[0] - self.sample_time * places(self.time)
+        return bool(np.abs(off).max() <= digit + noise)
 
     def need_even_sampling(self) -> None:
         """Raise MeasurementError at the first gap: a step that differs from the sample time by 1 %.

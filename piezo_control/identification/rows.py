@@ -181,9 +181,7 @@ def layout(rows: list[Row]) -> Layout:
     if at >= 0 and not (_length(rows[at].cells) == 1 < width):
         names, units, at = _named(rows, at, width)
         filled = max(map(_length, shown))
-        if (
-            len(names) > filled and names[-1].lower() == "comment"
-        ):  # of LabVIEW, mostly without cells
+        if len(names) > filled and names[-1].lower() == "comment":  # LabVIEW's, without cells
             names, units = names[:-1], units[:-1]
         if not filled <= len(names) <= width:
             raise ValueError(
@@ -221,11 +219,11 @@ def _refuse_thousands(rows: list[Row], decimal: str) -> None:
     thousands = re.compile(rf"[-+−]?[1-9]\d{{0,2}}([{decimal}]\d{{3}})+")
     doubtful, known = "", False
     for column in zip(*(row.cells for row in rows)):
-        marked = [cell for cell in column if decimal in cell]
-        if not all(thousands.fullmatch(cell) for cell in marked):
+        marked = next((cell for cell in column if decimal in cell), "")
+        if not all(thousands.fullmatch(cell) for cell in column if decimal in cell):
             known = decimal == ","
         elif marked and (decimal == "," or any(c.lstrip("-+−").isdigit() for c in column)):
-            doubtful = marked[0]
+            doubtful = marked
     if doubtful and not known:
         raise ValueError(
             f"'{doubtful}' is {doubtful.replace(decimal, '')}, or has decimals: numbers with three digits behind each "

@@ -64,7 +64,7 @@ class Table:
 
         `wanted` is NAME, NUMBER or a part of the name that only one column has, with ':UNIT' behind it where
         the file does not say; without it the quantity is looked for under its own name. The first of
-        `units` holds where nothing says another one. Raises TableError for what is not there, and for a unit that is not understood.
+        `units` holds where nothing says another one. Raises TableError for what is not there or not understood.
         """
         name, unit = self._parts(wanted, quantity)
         if unit and unit_of(unit) not in units:
@@ -92,11 +92,9 @@ class Table:
     def _parts(self, wanted: str | None, quantity: str) -> tuple[str, str]:
         """Return the name and the unit in NAME or NAME:UNIT; some names have a colon."""
         name, colon, unit = (wanted or "").rpartition(":")
-        return (
-            (name or quantity, unit)
-            if colon and wanted not in self.headers
-            else (wanted or quantity, "")
-        )
+        if not colon or wanted in self.headers:
+            name, unit = wanted or "", ""
+        return name or quantity, unit
 
     def _index(self, name: str, quantity: str, exact: bool) -> int | None:
         def plain(text: str) -> str:
@@ -150,6 +148,11 @@ class Table:
             )
         return values
 
+    def span(self, index: int) -> float:
+        """Return how far the numbers of a column are apart; 0 where there are none."""
+        values = self.numbers(index)
+        return float(np.ptp(values[np.isfinite(values)])) if np.isfinite(values).any() else 0.0
+
     def _clock(self, index: int, unit: str) -> tuple[str, NDArray[np.float64]] | None:
         """Return how a column writes instants, and these in seconds since the first; None for numbers.
 
@@ -158,9 +161,11 @@ class Table:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return None
-        text = with_points(column[~column.str.fullmatch(MISSING)], self.decimal)
-        if pd.to_numeric(text.iloc[:1], errors="coerce").notna().any() or text.empty:
+        written = column[~column.str.fullmatch(MISSING)]
+        begin = with_points(written.iloc[:1], self.decimal)
+        if written.empty or pd.to_numeric(begin, errors="coerce").notna().any():
             return None
+        text = with_points(written, self.decimal)
         parts = text.str.extract(r"^(?:(\d+):)?(\d+):(\d+(?:\.\d*)?)$").astype(float)
         first, second = parts[1], parts[2]
         if second.isna().any():
@@ -282,12 +287,8 @@ def _in_order(
         return {}
     places = {quantity: str(i) for quantity, i in zip(wanted, filled)}
     if "deflection" in places:
-        span = {
-            q: float(np.ptp(np.nan_to_num(table.numbers(int(i)))))
-            for q, i in places.items()
-            if q != "time"
-        }
-        stroke, voltage = span["deflection"], span.get("voltage", 0.0)
+        stroke = table.span(int(places["deflection"]))
+        voltage = table.span(int(places["voltage"])) if "voltage" in places else 0.0
         possible = [
             unit
             for unit in quantities["deflection"]
