@@ -7,6 +7,7 @@ import json
 import math
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -526,3 +527,48 @@ def test_the_bags_of_a_run_that_was_cut_are_deleted_by_no_later_one(tmp_path):
         (other / "report.html").write_text("done")
     assert (folder / "bags" / "cut.mcap").read_text() == "a day's work"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["step", "step.unfinished"]
+
+
+def put(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def test_results_replace_what_has_their_name_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    for name in ("mine", "step"):
+        put(out / "bags" / name / "metadata.yaml", "of before")
+        put(out / "bags" / name / "old.mcap", "of before")
+    with study.results_folder(out, True) as folder:
+        put(folder / "bags" / "step" / "metadata.yaml", "new")
+        put(folder / "report.html", "new")
+    assert sorted(p.name for p in (out / "bags" / "mine").iterdir()) == [
+        "metadata.yaml",
+        "old.mcap",
+    ]
+    assert [p.read_text() for p in (out / "bags" / "step").iterdir()] == ["new"]
+    assert (out / "report.html").read_text() == "new"
+    assert not folder.exists()
+
+
+def test_results_that_came_while_others_were_made_are_kept(tmp_path, capsys):
+    out = tmp_path / "out"
+    with (
+        pytest.raises(FileExistsError, match="is not empty"),
+        study.results_folder(out, False) as slow,
+    ):
+        with study.results_folder(out, False) as quick:
+            assert slow.exists()
+            put(quick / "report.html", "quick")
+        put(slow / "report.html", "slow")
+    assert (out / "report.html").read_text() == "quick"
+    assert (slow / "report.html").read_text() == "slow"
+    assert f"out: what was done until then is in {slow}" in capsys.readouterr().err
+
+
+def test_results_go_to_the_folder_one_is_in(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with study.results_folder(Path("."), False) as folder:
+        put(folder / "report.html", "done")
+    assert Path("report.html").read_text() == "done"
