@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from piezo_control.files import write_json
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.cases import RunFailed
@@ -45,8 +45,7 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
     try:
         with results_folder(out, arguments.overwrite) as folder:
             found, sections = work(arguments, folder, console)
-            text = json.dumps(found, indent=2, ensure_ascii=False)
-            (folder / "metrics.json").write_text(text + "\n")
+            write_json(folder / "metrics.json", found)
             write_html(folder / "report.html", title, sections)
     except (ParameterError, FileExistsError) as error:
         print(f"{name}: {error}", file=sys.stderr)
