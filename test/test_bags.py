@@ -23,7 +23,7 @@ from piezo_control.recording.writer import BagWriter
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 from piezo_sim.experiment.analysis import classify, steps
-from piezo_sim.experiment.bags import analysed, compare_bags
+from piezo_sim.experiment.bags import analyse_bags, analysed, compare_bags
 from piezo_sim.experiment.cli import main
 
 H = 1e-3  # s
@@ -260,7 +260,7 @@ def test_a_recording_that_cannot_be_analysed_stops_no_other(monkeypatch, tmp_pat
     assert (
         command(monkeypatch, "compare", good[0], tmp_path / "b/../a", "--out", tmp_path / "c") == 2
     )
-    assert "compare needs 2 recordings or more" in capsys.readouterr().err
+    assert "compare needs two bags or more, not 1" in capsys.readouterr().err
     assert command(monkeypatch, "compare", good[0], tmp_path / "none", "--out", tmp_path / "c") == 1
     assert "1 of 2 recordings can be analysed" in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
@@ -287,3 +287,39 @@ def test_a_bag_of_which_nothing_can_be_read_is_not_recovered(monkeypatch, tmp_pa
     assert command(monkeypatch, "recover", tmp_path / "empty", "--out", out) == 1
     assert f"{tmp_path}/empty: no message can be read of it" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty"]
+
+
+def part_of(path, reference, voltage, deflection, first):
+    """Write the samples of a loop that was recorded from sample `first` on."""
+    bag = Session(path)
+    for number, values in enumerate(zip(reference, deflection, voltage)):
+        stamp = WALL + number * 1_000_000
+        for name, value in zip(("reference", "deflection", "voltage"), values):
+            bag.sample(name, first + number, value, stamp, 0 if name == "reference" else 30_000)
+        bag.sample("command", first + number, values[0], stamp)
+    bag.bag.close()
+    return path
+
+
+def test_what_a_recording_looks_like_is_what_it_can_be_analysed_as(tmp_path):
+    """A decaying sine that is followed has no cycle from maximum to maximum, a finger that holds no step."""
+    time = H * np.arange(1000)
+    decaying = 1e-5 * np.exp(-3 * time) * np.sin(2 * np.pi * 5 * time)
+    home = part_of(tmp_path / "home", decaying, 2e6 * decaying + time, decaying, 500)
+    held = np.full(1000, 5e-6)
+    swing = 1e-8 * np.sin(2 * np.pi * 50 * time)
+    rest = part_of(tmp_path / "rest", held, 10.0 + time, held + 1e-7 + swing, 500)
+    found = analysed([home, rest])
+    assert {name: one.kind for name, one in found.items()} == {"home": "excite", "rest": "hold"}
+    figures = found["rest"].figures[""]
+    assert figures["reference_um"] == pytest.approx(5.0)
+    assert figures["mean_error_um"] == pytest.approx(0.1)
+    assert figures["peak_to_peak_um"] == pytest.approx(0.02)
+    assert len(analyse_bags(found, tmp_path)) == 3
+
+
+def test_a_recording_that_fits_no_kind_is_refused_by_what_it_looks_like():
+    ramp = np.linspace(0.0, 1e-5, 1000)
+    signals = {"temperature": np.full(1000, 22.0), "tip_force": np.zeros(1000)}
+    with pytest.raises(BagError, match="analysed as 'step': the reference goes from no value"):
+        classify(recording(reference=ramp, deflection=ramp, voltage=ramp**2, **signals))

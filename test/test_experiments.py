@@ -396,6 +396,7 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
             "not one of the known fast, integrator_notch, paper, pid, robust, robust_delay_2",
         ),
         (("--amplitude-v", 20.0), "--amplitude-v has no effect on any run"),
+        (("--amplitude-um", 0.0), "amplitude is 0, and 'step' needs a finger that moves"),
         (("--amplitude-um", 20e-6), "goes to 2e-05 um, must be 0 or from 0.01 to 1000 um"),
         (("--temperature", 22.0, 22.0), "two cases are called 'step_open_loop_22degc'"),
         (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
@@ -572,3 +573,12 @@ def test_results_go_to_the_folder_one_is_in(tmp_path, monkeypatch):
     with study.results_folder(Path("."), False) as folder:
         put(folder / "report.html", "done")
     assert Path("report.html").read_text() == "done"
+
+
+def test_figures_that_do_not_exist_are_refused_or_null(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "creep"
+    assert run_cli(monkeypatch, "creep", "--engine", "--duration", 0.5, "--out", out) == 1
+    assert "creep needs 1.5 s or more" in capsys.readouterr().err
+    results.write_metrics({"cases": [{"figure": math.nan, "limits": (-math.inf, 1.0)}]}, tmp_path)
+    content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert content == {"cases": [{"figure": None, "limits": [None, 1.0]}]}

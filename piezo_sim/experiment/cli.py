@@ -187,8 +187,9 @@ def _analyse(arguments: argparse.Namespace, least: int) -> tuple[dict[str, Any],
     from piezo_sim.experiment.bags import analysed, told_apart
 
     a = arguments
-    if len(told_apart(a.bags)) < least:
-        raise ParameterError(f"{a.command} needs {least} recordings or more")
+    given = len(told_apart(a.bags))
+    if given < least:
+        raise ParameterError(f"compare needs two bags or more, not {given}")
     refused: list[BagError] = []
     columns = chosen_columns(arguments, LOOP)
     found = analysed(a.bags, a.kind, a.finger, a.run, a.partial, *columns, refused=refused)
@@ -198,7 +199,7 @@ def _analyse(arguments: argparse.Namespace, least: int) -> tuple[dict[str, Any],
     for error in refused:
         print(f"experiment: left out: {error}", file=sys.stderr)
     if len(found) < least:
-        raise BagError(f"{len(found)} of {len(found) + len(refused)} recordings can be analysed")
+        raise BagError(f"{len(found)} of {given} recordings can be analysed")
     return found, FAILED if refused else DONE
 
 
