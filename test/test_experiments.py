@@ -2,10 +2,12 @@
 """The paper's table: every number again, by formulas of this file's own, from the bags of shorter runs."""
 
 import dataclasses
+import errno
 import io
 import json
 import math
 import re
+import signal
 import sys
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
 from piezo_control.shared import version
+from piezo_control.start import ENDING
 from piezo_sim.experiment import cli, paper, results, study
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
 from piezo_sim.experiment.cases import (
@@ -582,3 +585,30 @@ def test_figures_that_do_not_exist_are_refused_or_null(monkeypatch, tmp_path, ca
     results.write_metrics({"cases": [{"figure": math.nan, "limits": (-math.inf, 1.0)}]}, tmp_path)
     content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
     assert content == {"cases": [{"figure": None, "limits": [None, 1.0]}]}
+
+
+@pytest.fixture
+def handlers():
+    """Signals are handled afterwards as they were before."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, errno.ENOSPC], ids=str)
+def test_a_run_that_ends_early_says_what_is_left_where(
+    monkeypatch, handlers, tmp_path, capsys, end
+):
+    def run_into(folder, *_):
+        put(folder / "bags" / "step.mcap", "a minute's work")
+        if isinstance(end, signal.Signals):
+            signal.raise_signal(end)
+        raise OSError(end, "No space left on device")
+
+    monkeypatch.setattr(cli, "run_into", run_into)
+    assert run_cli(monkeypatch, "step", "--engine", "--out", tmp_path / "out") == 1
+    said = capsys.readouterr().err
+    assert f"out: what was done until then is in {tmp_path}/out.unfinished\n" in said
+    last = "stopped" if isinstance(end, signal.Signals) else "No space left on device"
+    assert said.endswith(f"{last}\n")
