@@ -65,7 +65,7 @@ build/docs/installed: docs/requirements.txt
 	touch $@
 
 clean:
-	rm -rf build install log
+	rm -rf build install log docs/generated piezo_control/servo/drivers/*.cpython-*.so
 
 distclean: clean
 	rm -rf .venv out

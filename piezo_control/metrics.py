@@ -147,11 +147,16 @@ def ringing(time: ArrayLike, value: ArrayLike, least: float = 0.05) -> Ringing:
 def drift(time: ArrayLike, value: ArrayLike, begin: float, average: float) -> float:
     """Return the change of `value` from time[0] + `begin` to the end, in its unit: creep.
 
-    Both are means over `average` seconds: the ones that follow `begin`, and the last ones.
+    Both are means over `average` seconds: the ones that follow `begin`, and the last ones. Raises ValueError when the
+    record is not longer than that.
     """
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)
     since = time - time[0]
+    if since[-1] < begin + average:
+        raise ValueError(
+            f"{since[-1]:g} s follow the step, creep needs {begin + average:g} s or more"
+        )
     first = value[(since >= begin) & (since < begin + average)]
     last = value[since > since[-1] - average]
     return float(np.mean(last) - np.mean(first))

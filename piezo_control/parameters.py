@@ -20,6 +20,8 @@ from typing import Any, TypeVar, get_type_hints
 
 import yaml
 
+from piezo_control.files import replaced
+
 T = TypeVar("T")
 
 OF_EVERY_NODE = {"autostart", "use_sim_time", "start_type_description_service", "qos_overrides"}
@@ -297,4 +299,5 @@ def dump(path: str | Path, node: str, values: Mapping[str, Any], comment: str = 
     text = "".join(f"# {line}\n" for line in comment.splitlines())
     content = {f"/**/{node}": {"ros__parameters": tree}}
     text += yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=100)
-    Path(path).write_text(text)
+    with replaced(Path(path)) as (place,):
+        place.write_text(text)

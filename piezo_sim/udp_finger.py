@@ -23,6 +23,7 @@ import numpy as np
 from numba import types
 
 from piezo_control.compiled import compiled
+from piezo_control.files import write_json
 from piezo_control.options import port, within
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
@@ -236,7 +237,7 @@ def main() -> int:
     print(json.dumps(report))
     if arguments.report:
         try:
-            Path(arguments.report).write_text(json.dumps(report, indent=2) + "\n")
+            write_json(Path(arguments.report), report)
         except OSError as error:
             print(f"udp_finger: --report {arguments.report}: {error.strerror}", file=sys.stderr)
             return 1

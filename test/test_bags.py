@@ -2,7 +2,7 @@
 """Bags as users make them: several references in one, lost samples, late joiners, clocks on the wall."""
 
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from piezo_control.recording.writer import BagWriter
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 from piezo_sim.experiment.analysis import classify, steps
-from piezo_sim.experiment.bags import analysed, compare_bags
+from piezo_sim.experiment.bags import analyse_bags, analysed, compare_bags
 from piezo_sim.experiment.cli import main
 
 H = 1e-3  # s
@@ -221,3 +221,105 @@ def test_tables_are_analysed_and_compared_on_the_command_line(monkeypatch, tmp_p
         monkeypatch.setattr(sys, "argv", ["experiment", *map(str, words), "--out", str(out)])
         assert main() == 0, capsys.readouterr().err
         assert (out / "report.html").exists()
+
+
+def command(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["experiment", *map(str, words)])
+    return main()
+
+
+def test_a_figure_that_one_recording_lacks_has_no_difference(tmp_path):
+    """Tables do not say whether a limit acted; bags do."""
+    figures = analysed([session(tmp_path / "bag")])["bag"]
+    of_table = {
+        name: {q: value for q, value in one.items() if q != "limited_percent"}
+        for name, one in figures.figures.items()
+    }
+    found = {"table": replace(figures, figures=of_table), "bag": figures}
+    section, _ = compare_bags(found, tmp_path)
+    column = section.columns.index("at a limit [% of samples]")
+    (row, *_) = (row for row in section.rows if row[0].startswith("  bag − table"))
+    assert row[column] == "–" and row[column - 1] != "–"
+
+
+def test_why_recordings_of_other_steps_are_not_subtracted_is_said(tmp_path):
+    found = analysed([session(tmp_path / "a"), session(tmp_path / "b", first=100)])
+    section, _ = compare_bags(found, tmp_path)
+    assert section.rows[-1][0] == "  b − a: none, it has 2 steps and not 3"
+    assert set(section.rows[-1][1:]) == {"–"}
+
+
+def test_a_recording_that_cannot_be_analysed_stops_no_other(monkeypatch, tmp_path, capsys):
+    good = [session(tmp_path / name) for name in "ab"]
+    for number, words in enumerate((["analyse", *good], ["compare", *good])):
+        out = tmp_path / f"out{number}"
+        assert command(monkeypatch, *words, tmp_path / "none", "--out", out) == 1
+        said = capsys.readouterr()
+        assert f"left out: {tmp_path}/none: " in said.err
+        assert "0.6 s: 10 → -5 µm" in " ".join(said.out.split()) and (out / "report.html").exists()
+    assert (
+        command(monkeypatch, "compare", good[0], tmp_path / "b/../a", "--out", tmp_path / "c") == 2
+    )
+    assert "compare needs two bags or more, not 1" in capsys.readouterr().err
+    assert command(monkeypatch, "compare", good[0], tmp_path / "none", "--out", tmp_path / "c") == 1
+    assert "1 of 2 recordings can be analysed" in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()
+
+
+def test_recovered_bags_are_told_apart_and_named_where_they_are(monkeypatch, tmp_path, capsys):
+    bags = [session(tmp_path / side / "bag") for side in ("left", "right")]
+    out = tmp_path / "out"
+    assert command(monkeypatch, "recover", *bags, "--out", out) == 0
+    assert f"written to {out}/left/bag" in capsys.readouterr().out
+    for side, bag in zip(("left", "right"), bags):
+        np.testing.assert_array_equal(read(out / side / "bag").deflection, read(bag).deflection)
+    monkeypatch.chdir(bags[0])
+    assert command(monkeypatch, "recover", ".", "bag.mcap", "--out", tmp_path / "here") == 1
+    assert "which exists" in capsys.readouterr().err  # the file is the folder's own
+    assert [p.name for p in (tmp_path / "here").iterdir()] == ["bag"]
+    assert command(monkeypatch, "recover", "bag.mcap", "--out", tmp_path / "file") == 0
+    assert (tmp_path / "file" / "bag" / "bag.mcap").exists()
+
+
+def test_a_bag_of_which_nothing_can_be_read_is_not_recovered(monkeypatch, tmp_path, capsys):
+    BagWriter(tmp_path / "empty").close()
+    out = tmp_path / "out"
+    assert command(monkeypatch, "recover", tmp_path / "empty", "--out", out) == 1
+    assert f"{tmp_path}/empty: no message can be read of it" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["empty"]
+
+
+def part_of(path, reference, voltage, deflection, first):
+    """Write the samples of a loop that was recorded from sample `first` on."""
+    bag = Session(path)
+    for number, values in enumerate(zip(reference, deflection, voltage)):
+        stamp = WALL + number * 1_000_000
+        for name, value in zip(("reference", "deflection", "voltage"), values):
+            bag.sample(name, first + number, value, stamp, 0 if name == "reference" else 30_000)
+        bag.sample("command", first + number, values[0], stamp)
+    bag.bag.close()
+    return path
+
+
+def test_what_a_recording_looks_like_is_what_it_can_be_analysed_as(tmp_path):
+    """A decaying sine that is followed has no cycle from maximum to maximum, a finger that holds no step."""
+    time = H * np.arange(1000)
+    decaying = 1e-5 * np.exp(-3 * time) * np.sin(2 * np.pi * 5 * time)
+    home = part_of(tmp_path / "home", decaying, 2e6 * decaying + time, decaying, 500)
+    held = np.full(1000, 5e-6)
+    swing = 1e-8 * np.sin(2 * np.pi * 50 * time)
+    rest = part_of(tmp_path / "rest", held, 10.0 + time, held + 1e-7 + swing, 500)
+    found = analysed([home, rest])
+    assert {name: one.kind for name, one in found.items()} == {"home": "excite", "rest": "hold"}
+    figures = found["rest"].figures[""]
+    assert figures["reference_um"] == pytest.approx(5.0)
+    assert figures["mean_error_um"] == pytest.approx(0.1)
+    assert figures["peak_to_peak_um"] == pytest.approx(0.02)
+    assert len(analyse_bags(found, tmp_path)) == 3
+
+
+def test_a_recording_that_fits_no_kind_is_refused_by_what_it_looks_like():
+    ramp = np.linspace(0.0, 1e-5, 1000)
+    signals = {"temperature": np.full(1000, 22.0), "tip_force": np.zeros(1000)}
+    with pytest.raises(BagError, match="analysed as 'step': the reference goes from no value"):
+        classify(recording(reference=ramp, deflection=ramp, voltage=ramp**2, **signals))

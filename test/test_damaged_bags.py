@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.progress import Progress
+from test_bags import WALL, H, Session
 
 from piezo_control.recording.reader import BagError
 from piezo_control.recording.recording import read
@@ -85,3 +86,18 @@ def test_a_database_of_something_else_is_refused(tmp_path):
         database.execute("create table messages (id integer)")
     with pytest.raises(BagError, match="a.db3"):
         read(path, partial=True)
+
+
+def test_the_files_of_a_split_bag_are_read_in_the_order_they_were_written(tmp_path):
+    for part in range(12):
+        bag = Session(tmp_path / f"{part}")
+        for number in range(10 * part, 10 * part + 10):
+            stamp = WALL + round(number * H * 1e9)
+            for signal in ("deflection", "command", "voltage"):
+                bag.sample(signal, number, number, stamp)
+        bag.bag.close()
+        (tmp_path / "split").mkdir(exist_ok=True)
+        (tmp_path / f"{part}" / f"{part}.mcap").rename(tmp_path / "split" / f"run_{part}.mcap")
+    np.testing.assert_array_equal(
+        read(tmp_path / "split", partial=True).deflection, np.arange(120.0)
+    )

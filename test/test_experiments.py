@@ -2,11 +2,14 @@
 """The paper's table: every number again, by formulas of this file's own, from the bags of shorter runs."""
 
 import dataclasses
+import errno
 import io
 import json
 import math
 import re
+import signal
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from rosbags.highlevel import AnyReader
 from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
 from piezo_control.shared import version
+from piezo_control.start import ENDING
 from piezo_sim.experiment import cli, paper, results, study
 from piezo_sim.experiment.analysis import QUANTITIES, analyse, classify
 from piezo_sim.experiment.cases import (
@@ -395,6 +399,7 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
             "not one of the known fast, integrator_notch, paper, pid, robust, robust_delay_2",
         ),
         (("--amplitude-v", 20.0), "--amplitude-v has no effect on any run"),
+        (("--amplitude-um", 0.0), "amplitude is 0, and 'step' needs a finger that moves"),
         (("--amplitude-um", 20e-6), "goes to 2e-05 um, must be 0 or from 0.01 to 1000 um"),
         (("--temperature", 22.0, 22.0), "two cases are called 'step_open_loop_22degc'"),
         (("--sample-time", 1e-3), "must be that of controller 'paper': 0.0001 s"),
@@ -526,3 +531,84 @@ def test_the_bags_of_a_run_that_was_cut_are_deleted_by_no_later_one(tmp_path):
         (other / "report.html").write_text("done")
     assert (folder / "bags" / "cut.mcap").read_text() == "a day's work"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["step", "step.unfinished"]
+
+
+def put(path, text):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def test_results_replace_what_has_their_name_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    for name in ("mine", "step"):
+        put(out / "bags" / name / "metadata.yaml", "of before")
+        put(out / "bags" / name / "old.mcap", "of before")
+    with study.results_folder(out, True) as folder:
+        put(folder / "bags" / "step" / "metadata.yaml", "new")
+        put(folder / "report.html", "new")
+    assert sorted(p.name for p in (out / "bags" / "mine").iterdir()) == [
+        "metadata.yaml",
+        "old.mcap",
+    ]
+    assert [p.read_text() for p in (out / "bags" / "step").iterdir()] == ["new"]
+    assert (out / "report.html").read_text() == "new"
+    assert not folder.exists()
+
+
+def test_results_that_came_while_others_were_made_are_kept(tmp_path, capsys):
+    out = tmp_path / "out"
+    with (
+        pytest.raises(FileExistsError, match="is not empty"),
+        study.results_folder(out, False) as slow,
+    ):
+        with study.results_folder(out, False) as quick:
+            assert slow.exists()
+            put(quick / "report.html", "quick")
+        put(slow / "report.html", "slow")
+    assert (out / "report.html").read_text() == "quick"
+    assert (slow / "report.html").read_text() == "slow"
+    assert f"out: what was done until then is in {slow}" in capsys.readouterr().err
+
+
+def test_results_go_to_the_folder_one_is_in(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with study.results_folder(Path("."), False) as folder:
+        put(folder / "report.html", "done")
+    assert Path("report.html").read_text() == "done"
+
+
+def test_figures_that_do_not_exist_are_refused_or_null(monkeypatch, tmp_path, capsys):
+    out = tmp_path / "creep"
+    assert run_cli(monkeypatch, "creep", "--engine", "--duration", 0.5, "--out", out) == 1
+    assert "creep needs 1.5 s or more" in capsys.readouterr().err
+    results.write_metrics({"cases": [{"figure": math.nan, "limits": (-math.inf, 1.0)}]}, tmp_path)
+    content = json.loads((tmp_path / "metrics.json").read_text(), parse_constant=pytest.fail)
+    assert content == {"cases": [{"figure": None, "limits": [None, 1.0]}]}
+
+
+@pytest.fixture
+def handlers():
+    """Signals are handled afterwards as they were before."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, errno.ENOSPC], ids=str)
+def test_a_run_that_ends_early_says_what_is_left_where(
+    monkeypatch, handlers, tmp_path, capsys, end
+):
+    def run_into(folder, *_):
+        put(folder / "bags" / "step.mcap", "a minute's work")
+        if isinstance(end, signal.Signals):
+            signal.raise_signal(end)
+        raise OSError(end, "No space left on device")
+
+    monkeypatch.setattr(cli, "run_into", run_into)
+    assert run_cli(monkeypatch, "step", "--engine", "--out", tmp_path / "out") == 1
+    said = capsys.readouterr().err
+    assert f"out: what was done until then is in {tmp_path}/out.unfinished\n" in said
+    last = "stopped" if isinstance(end, signal.Signals) else "No space left on device"
+    assert said.endswith(f"{last}\n")

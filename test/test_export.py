@@ -6,6 +6,7 @@ skipped without them.
 """
 
 import ctypes
+import errno
 import re
 import shutil
 import subprocess
@@ -354,3 +355,21 @@ def test_force_exports_and_says_so_in_the_header_and_nothing_is_replaced_unasked
     assert status == 2 and "finger.h" in error and "--overwrite" in error
     assert export("--overwrite") == (0, "")
     assert "NOT CERTIFIED" not in (tmp_path / "firmware" / "finger.h").read_text()
+
+
+def test_a_full_disk_leaves_the_firmware_of_before(tmp_path, monkeypatch):
+    write(tmp_path, {"finger.h": "old", "finger.c": "old"})
+    written = Path.write_text
+
+    def full(path, text):
+        written(path, text[: len(text) // 2])
+        if path.name.endswith(".c"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return written(path, text)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path, {"finger.h": "new", "finger.c": "new"})
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(
+        ("finger.h", "finger.c"), "old"
+    )

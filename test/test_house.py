@@ -23,6 +23,7 @@ LEVELS = [
         "compiled",
         "start",
         "options",
+        "files",
     },
     {
         "hysteresis",

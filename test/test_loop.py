@@ -16,11 +16,14 @@ from mcap.reader import make_reader
 from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
+from piezo_control.nodes.client import connect
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import read
+from piezo_sim.experiment import cli
 from piezo_sim.experiment.cases import NODES, Case
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.on_nodes.processes import NodeDied
+from piezo_sim.experiment.on_nodes import grasp, servo
+from piezo_sim.experiment.on_nodes.processes import NodeDied, NodeProcesses
 from piezo_sim.experiment.on_nodes.runner import run_cases
 
 SAMPLES = 600
@@ -191,3 +194,24 @@ def test_refused_parameters_are_named(tmp_path):
     bad = replace(closed_loop("bad"), temperature={"base_degc": 500.0})
     with pytest.raises(ValueError, match=r"case 'bad': temperature: 'base_degc' is 500.0, .*150"):
         bad.parameters()
+
+
+@pytest.mark.parametrize(
+    "main, words, namespace",
+    [(cli.main, ["step"], "/finger"), (grasp.main, [], "/left"), (servo.main, [], "/")],
+    ids=["experiment", "grasp", "servo"],
+)
+def test_nodes_that_run_are_left_alone(main, words, namespace, tmp_path, monkeypatch, capsys):
+    commands = {"feedforward": ["--ros-args", "-r", f"__ns:={namespace}", "-p", "autostart:=false"]}
+    with NodeProcesses(commands, tmp_path / "log") as nodes:
+        with connect(30.0) as ros:
+            ros.wait(lambda: bool(ros.nodes()), lambda: "no node")
+            before = ros.nodes()
+        monkeypatch.setattr(sys, "argv", ["main", *words, "--out", str(tmp_path / "out")])
+        assert main() == 2
+        said = capsys.readouterr().err
+        assert f"{namespace} has nodes already: feedforward; end them, or name another" in said
+        nodes.check()
+        with connect(30.0) as ros:
+            ros.wait(lambda: ros.nodes() == before, lambda: f"{ros.nodes()}, not {before}")
+    assert [path.name for path in tmp_path.iterdir()] == ["log"]

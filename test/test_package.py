@@ -167,3 +167,21 @@ def test_a_build_without_the_messages_says_what_to_type(tmp_path):
     assert build.returncode == 1
     line = f"ln -s {ROOT.name}/msg_defs {ROOT.parent / 'piezo_gripper_msgs'}"
     assert build.stderr.splitlines()[-1].strip() == line
+
+
+def test_clean_removes_what_was_built_and_nothing_else(tmp_path):
+    drivers = tmp_path / "piezo_control" / "servo" / "drivers"
+    built = [
+        "build",
+        "install",
+        "log",
+        "docs/generated",
+        *(drivers / f"{n}.cpython-311-x.so" for n in ("udp", "iio")),
+    ]
+    mine = [drivers / "my_driver.so", "docs/index.md", ".venv/bin/python", "out/step/report.html"]
+    for path in (*built, *mine):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).touch()
+    for goal, kept in (("clean", mine), ("distclean", mine[:2])):
+        subprocess.run(["make", "-f", ROOT / "Makefile", goal], cwd=tmp_path, check=True)
+        assert [path for path in (*built, *mine) if (tmp_path / path).exists()] == kept

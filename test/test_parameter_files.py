@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files as people and `ros2 param dump` write them, and files that are none."""
 
+import errno
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.parameters import ParameterError, build, load, need_one_for, provenance
+from piezo_control.parameters import ParameterError, build, dump, load, need_one_for, provenance
 
 
 def written(tmp_path, text):
@@ -130,3 +133,23 @@ def test_whole_numbers_stand_for_floats_and_nothing_else_does():
 def test_an_unknown_name_is_answered_with_the_nearest(written, meant):
     with pytest.raises(ParameterError, match=f"'{written}'; did you mean '{meant}'"):
         build(FeedforwardParameters, {written: 5.0})
+
+
+def test_a_full_disk_leaves_the_file_of_before(tmp_path, monkeypatch):
+    path, link = tmp_path / "mine.yaml", tmp_path / "link.yaml"
+    link.symlink_to(path)
+    dump(path, "feedback", {"sample_time": 1e-3})
+    dump(link, "feedback", {"sample_time": 1e-4})
+    assert link.is_symlink() and load(path, "feedback") == {"sample_time": 1e-4}
+    before = path.read_text()
+    written = Path.write_text
+
+    def full(place, text):
+        written(place, text[:9])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        dump(path, "feedback", {"sample_time": 1e-2})
+    assert path.read_text() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["link.yaml", "mine.yaml"]

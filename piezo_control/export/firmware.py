@@ -21,6 +21,7 @@ from piezo_control import safety
 from piezo_control.export.vectors import vectors
 from piezo_control.feedback import FeedbackParameters, feedback_coefficients, hand_over
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.files import replaced
 from piezo_control.parameters import ParameterError
 from piezo_control.servo import driver, law
 from piezo_control.servo.parameters import ServoParameters
@@ -121,11 +122,13 @@ def firmware(
 
 
 def write(folder: Path, files: dict[str, str]) -> list[Path]:
-    """Write the files into `folder`, which is made if it is not there; return their paths."""
+    """Write the files, all or none, into `folder`, which is made if it is not there; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in files.items():
-        (folder / name).write_text(text)
-    return [folder / name for name in files]
+    paths = [folder / name for name in files]
+    with replaced(*paths) as places:
+        for place, text in zip(places, files.values()):
+            place.write_text(text)
+    return paths
 
 
 def _double(value: float) -> str:

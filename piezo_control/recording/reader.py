@@ -9,6 +9,7 @@ https://github.com/ros2/rosbag2/tree/jazzy/rosbag2_storage_sqlite3.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,15 +86,20 @@ def open_bag(path: str | Path) -> Bag:
     else:
         damage = "the recorder did not finish it: metadata.yaml is missing" if path.is_dir() else ""
     bag = Bag(path, get_typestore(Stores.ROS2_JAZZY), {}, damage)
-    files = sorted(f for f in (path.iterdir() if path.is_dir() else [path]) if f.is_file())
+    files = [f for f in (path.iterdir() if path.is_dir() else [path]) if f.is_file()]
     readers = {".mcap": _read_mcap, ".db3": _read_sqlite}
-    storage = [f for f in files if f.suffix in readers]
+    storage = sorted((f for f in files if f.suffix in readers), key=_in_turn)
     if not storage:
         raise BagError(f"{path}: no bag: no .mcap or .db3 file{f' ({damage})' if damage else ''}")
     for file in storage:
         if not readers[file.suffix](file, bag):
             bag.damage = bag.damage or f"{file.name} ends in the middle"
     return bag
+
+
+def _in_turn(path: Path) -> list[str | int]:
+    """Return what sorts the files of a split bag by their numbers: the tenth after the second."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
 
 def _whole(path: Path) -> Bag:

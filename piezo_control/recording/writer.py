@@ -21,7 +21,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from piezo_control.profile import Profile
-from piezo_control.recording.reader import open_bag
+from piezo_control.recording.reader import BagError, open_bag
 from piezo_control.recording.recording import (
     LINEAR,
     PROFILE_TYPE,
@@ -92,11 +92,15 @@ class BagWriter:
 
 
 def recover(path: Path, to: Path) -> str:
-    """Write what can be read of the bag at `path` as a whole bag; return a sentence of what was found.
+    """Write what can be read of the bag at `path` as a whole bag; return a sentence of what was in it.
 
-    Raises BagError for what is no bag at all, ValueError when `to` exists.
+    Raises BagError for what is no bag at all or one of which nothing can be read, ValueError when `to` exists.
     """
     found = open_bag(path)
+    if not any(topic.data for topic in found.topics.values()):
+        raise BagError(
+            f"{path}: no message can be read of it{f' ({found.damage})' if found.damage else ''}"
+        )
     bag = BagWriter(to)
     bag.typestore = found.typestore
     messages = []
@@ -108,7 +112,7 @@ def recover(path: Path, to: Path) -> str:
         bag.write(connection, stamp, data)
     bag.close()
     condition = f"was cut ({found.damage})" if found.damage else "was whole"
-    return f"{path} {condition}: {found.content()} written to {to}"
+    return f"{path} {condition}: {found.content()}"
 
 
 def write_recording(

@@ -2,14 +2,15 @@
 """From a recording to its figures of merit; everything here is computed from bags alone.
 
 There is one analysis per kind of experiment, a function of a recording that returns ``{quantity: value}``.
-`QUANTITIES` says how each is shown and what it is; a value that does not exist, a settling that never comes, is None.
+`QUANTITIES` says how each is shown and what it is; :func:`analyse` makes a value that does not exist, a settling that
+never comes, None.
 The definitions are those of :mod:`piezo_control.metrics`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -41,6 +42,7 @@ QUANTITIES = {
     "static_error_percent": Quantity("static error [%]", 3, "distance of the mean of the last tenth of the record from the reference, in % of the step"),
     "creep_um": Quantity("creep [µm]", 2, "way from 1 s after the step of the voltage to the end, both averaged over 0.5 s"),
     "creep_percent": Quantity("creep [%]", 1, "creep in % of the deflection 1 s after the step"),
+    "mean_error_um": Quantity("mean error [µm]", 3, "mean of the deflection less the reference"),
     "peak_to_peak_um": Quantity("peak to peak [µm]", 2, "highest less lowest deflection, of the last cycle where there are cycles"),
     "loop_width_um": Quantity("loop width [µm]", 2, "largest distance, at one drive, of the falling from the rising branch of the last cycle"),
     "loop_width_percent": Quantity("loop width [%]", 2, "loop width in % of peak to peak"),
@@ -74,7 +76,10 @@ def transient(recording: Recording) -> Figures:
     """Return final deflection, ringing and damping after a step of the voltage (Fig. 3)."""
     begin = _begin(recording.voltage, "voltage")
     time, value = recording.time[begin:], recording.deflection[begin:]
-    ringing = metrics.ringing(time, value)
+    try:
+        ringing = metrics.ringing(time, value)
+    except ValueError:  # a finger that is damped, or sampled too slowly to show it
+        ringing = metrics.Ringing(math.nan, math.nan)
     return {
         "final_um": float(np.mean(value[-max(1, value.size // 10) :])) * 1e6,
         "ringing_hz": ringing.frequency_hz,
@@ -168,9 +173,9 @@ def step(recording: Recording) -> Figures:
     figures = metrics.step_metrics(last.time[begin:], last.deflection[begin:], reference, initial)
     return {
         "reference_um": reference * 1e6,
-        "settling_time_5pct_ms": _finite(figures.settling_5_final_s * 1e3),
-        "settling_time_2pct_ms": _finite(figures.settling_2_final_s * 1e3),
-        "rise_time_ms": _finite(figures.rise_s * 1e3),
+        "settling_time_5pct_ms": figures.settling_5_final_s * 1e3,
+        "settling_time_2pct_ms": figures.settling_2_final_s * 1e3,
+        "rise_time_ms": figures.rise_s * 1e3,
         "overshoot_percent": figures.overshoot * 100,
         "static_error_percent": figures.static_error * 100,
     }
@@ -186,7 +191,7 @@ def frequency(recording: Recording) -> Figures:
     return {
         "lowest_rad_s": float(response.frequency[0]),
         "highest_rad_s": float(response.frequency[-1]),
-        "bandwidth_rad_s": _finite(metrics.bandwidth(response)),
+        "bandwidth_rad_s": metrics.bandwidth(response),
         "peak_db": float(np.max(magnitude) - magnitude[0]),
     }
 
@@ -227,8 +232,18 @@ def force(recording: Recording) -> Figures:
         "force_change_mn": figures.change * 1e3,
         "deflection_change_um": figures.excursion * 1e6,
         "change_per_force_um_per_mn": figures.rejection * 1e3,
-        "recovery_ms": _finite(figures.recovery_s * 1e3),
+        "recovery_ms": figures.recovery_s * 1e3,
         "remaining_um": figures.remaining * 1e6,
+    }
+
+
+def hold(recording: Recording) -> Figures:
+    """Return how well a deflection is held where nothing else happens."""
+    error = recording.deflection - recording.reference
+    return {
+        "reference_um": float(recording.reference[-1]) * 1e6,
+        "mean_error_um": float(np.mean(error)) * 1e6,
+        "peak_to_peak_um": float(np.ptp(recording.deflection)) * 1e6,
     }
 
 
@@ -244,6 +259,7 @@ ANALYSES: dict[str, Callable[[Recording], Figures]] = {
         frequency,
         thermal,
         force,
+        hold,
     )  # fmt: skip
 }
 
@@ -254,7 +270,7 @@ def analyse(recording: Recording, kind: str) -> Figures:
     Raises BagError when the signals are not those of such an experiment.
     """
     try:
-        figures = ANALYSES[kind](recording)
+        figures = {name: _finite(value) for name, value in ANALYSES[kind](recording).items()}
         if np.all(np.isfinite(recording.limited)):
             figures["limited_percent"] = float(np.mean(recording.limited)) * 100
         return {**figures, "samples": int(recording.time.size)}
@@ -263,35 +279,55 @@ def analyse(recording: Recording, kind: str) -> Figures:
 
 
 def classify(recording: Recording) -> str:
-    """Return the kind of experiment that the signals of a recording suggest.
+    """Return the kind of experiment that the signals of a recording suggest, and as which they can be analysed.
 
     In this order: a reference that goes from value to value, which a controller follows; a tip force that
     changes, a temperature that changes; a reference of many frequencies; a cyclic one (`hysteresis` when the
-    voltage is proportional to it, `excite` when its amplitude changes, too); a voltage held under a static
-    gain (`creep` when that lasts for more than 10 s); any other reference: a step. Without a reference the
-    voltage decides.
+    voltage is proportional to it); any other one that swings (`excite`); one that stays what it was before (`hold`);
+    a voltage held under a static gain (`creep` when that lasts for more than 10 s); any other reference: a step.
+    Without a reference the voltage decides.
+
+    Raises BagError saying why it cannot be analysed as the first of these.
     """
+    refusals = []
+    for kind in _suggested(recording):
+        try:
+            analyse(recording, kind)
+            return kind
+        except BagError as error:
+            refusals.append(error)
+    nothing = BagError("neither reference nor voltage was recorded: name the kind of experiment")
+    raise next(iter(refusals), nothing)
+
+
+def _suggested(recording: Recording) -> Iterator[str]:
+    """Yield the kinds of experiment that :func:`classify` has to choose from, the likeliest first."""
     has_reference = bool(np.all(np.isfinite(recording.reference)))
     drive = recording.reference if has_reference else recording.voltage
     if not np.all(np.isfinite(drive)):
-        raise BagError("neither reference nor voltage was recorded: name the kind of experiment")
+        return
     is_static = not has_reference or _is_proportional(recording.voltage, drive)
     if not is_static and len(steps(recording)) > 1:
-        return "step"
+        yield "step"
     if np.ptp(recording.tip_force) > 0.0:
-        return "force"
+        yield "force"
     if np.ptp(recording.temperature) >= WARMING:
-        return "thermal"
+        yield "thermal"
     tops, bottoms = _turns(drive), _turns(-drive)
     if tops.size + bottoms.size > 1:
         if not (_is_even(np.diff(tops)) and _is_even(np.diff(bottoms))):
-            return "frequency"
-        if not is_static:
-            return "feedforward"
-        return "hysteresis" if _is_even(drive[tops]) and _is_even(drive[bottoms]) else "excite"
-    if not is_static:
-        return "step"
-    return "creep" if recording.time[-1] > 10.0 else "transient"
+            yield "frequency"
+        elif not is_static:
+            yield "feedforward"
+        elif _is_even(drive[tops]) and _is_even(drive[bottoms]):
+            yield "hysteresis"
+        yield "excite"
+    elif np.ptp(drive) == 0.0 and (recording.number[0] > 0 or drive[0] == 0.0):
+        yield "hold"
+    elif is_static:
+        yield "creep" if recording.time[-1] > 10.0 else "transient"
+    else:
+        yield "step"
 
 
 def _turns(drive: np.ndarray) -> np.ndarray:
@@ -331,5 +367,5 @@ def _loop(recording: Recording, drive: str) -> metrics.LoopMetrics:
     return metrics.loop_metrics(values[cycle], recording.deflection[cycle])
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -37,13 +37,14 @@ def analysed(
     partial: bool = False,
     columns: Mapping[str, str] | None = None,
     sample_time: float | None = None,
+    refused: list[BagError] | None = None,
 ) -> dict[str, Analysed]:
     """Return bags and tables, by the shortest ends of their paths that tell them apart.
 
     Each as `kind`, or as what it looks like. `finger`, `run` and `partial` are of bags
     (:func:`piezo_control.recording.recording.read`), `columns` and `sample_time` of tables
-    (:func:`piezo_control.identification.table.read_columns`). Raises BagError naming the file when its signals
-    are not those of such an experiment.
+    (:func:`piezo_control.identification.table.read_columns`). A recording whose signals are not those of
+    such an experiment is left out, and the BagError that names it put into `refused`; raised, where there is none.
     """
 
     def recorded(path: Path) -> tuple[Recording, str]:
@@ -51,14 +52,24 @@ def analysed(
             return read(path, finger, run, partial), ""
         return _read_table(path, columns or {}, sample_time)
 
-    names = {bag: bag.resolve() for bag in bags}
+    found = {}
+    for name, bag in told_apart(bags).items():
+        try:
+            found[name] = _analyse(bag, *recorded(bag), kind)
+        except BagError as error:
+            if refused is None:
+                raise
+            refused.append(error)
+    return found
+
+
+def told_apart(paths: Iterable[Path]) -> dict[str, Path]:
+    """Return paths by their shortest ends that tell them apart; what is one place is there once."""
+    places = {path.resolve(): path for path in paths}
     parts = 1
-    while len({Path(*path.parts[-parts:]) for path in names.values()}) < len(names):
+    while len({place.parts[-parts:] for place in places}) < len(places):
         parts += 1
-    return {
-        str(Path(*path.parts[-parts:])): _analyse(bag, *recorded(bag), kind)
-        for bag, path in names.items()
-    }
+    return {str(Path(*place.parts[-parts:])): path for place, path in places.items()}
 
 
 def _read_table(
@@ -134,8 +145,8 @@ def analyse_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
 def compare_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
     """Return sections with all bags in one plot and one table, the first being the reference.
 
-    Below each other bag the table says how far its figures are from those of the first, step by step. Raises
-    BagError when the bags are of different kinds.
+    Below each other bag the table says how far its figures are from those of the first, step by step, or why not.
+    Raises BagError when the bags are of different kinds.
     """
     kinds = {name: one.kind for name, one in found.items()}
     if len(set(kinds.values())) > 1:
@@ -148,7 +159,10 @@ def compare_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
     first = next(iter(found))
     for name, one in found.items():
         rows |= {f"{name} {of}".strip(): figures for of, figures in one.figures.items()}
-        if name != first and len(one.figures) == len(found[first].figures):
+        here, there = len(one.figures), len(found[first].figures)
+        if here != there:
+            rows[f"  {name} − {first}: none, it has {here} steps and not {there}"] = {}
+        elif name != first:
             pairs = zip(one.figures.items(), found[first].figures.values())
             rows |= {
                 f"  {name} − {first} {of}".rstrip(): _difference(figures, others)
@@ -165,5 +179,5 @@ def _said(one: Analysed) -> str:
 
 
 def _difference(row: Figures, first: Figures) -> Figures:
-    pairs = {quantity: (value, first[quantity]) for quantity, value in row.items()}
+    pairs = {quantity: (value, first.get(quantity)) for quantity, value in row.items()}
     return {q: None if a is None or b is None else a - b for q, (a, b) in pairs.items()}

@@ -45,6 +45,8 @@ COMPENSATORS = {
     "feedback": "inverse",
 }
 """Mode of a case to compensator of its feedforward."""
+HOLDING = ("thermal", "force")
+"""Analyses that need no motion."""
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
 EXPERIMENT_KEYS = {
     "title": "heading of the report",
@@ -331,6 +333,9 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
         raise ParameterError(
             f"{where}: 'duration' is {run['duration']} s, needs two samples or more"
         )
+    analysis, reference = run.get("analysis", experiment), _reference(run, where)
+    if analysis not in HOLDING and not np.any(reference.value):
+        raise ParameterError(f"{where}: amplitude is 0, and '{analysis}' needs a finger that moves")
     temperatures = [None] if "temperature" in run else run.get("temperature_degc", [22.0])
     modes, controllers = _listed(run["mode"]), _listed(run.get("controller", "none"))
     cases = []
@@ -352,13 +357,13 @@ def _expand(experiment: str, run: dict[str, Any], where: str) -> list[Case]:
             Case(
                 experiment=experiment,
                 name="_".join(parts),
-                analysis=run.get("analysis", experiment),
+                analysis=analysis,
                 mode=mode,
                 controller=controller,
                 plant=run.get("plant", "prandtl_ishlinskii"),
                 sample_time=run["sample_time"],
                 duration=run["duration"],
-                reference=_reference(run, where),
+                reference=reference,
                 tip_force=profile(run.get("tip_force", NO_FORCE), "mn", where),
                 temperature=run.get("temperature") or {"profile": "constant", "base_degc": degc},
                 engine=run.get("engine", False),

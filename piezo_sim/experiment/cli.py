@@ -20,6 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from piezo_control.identification.columns import LOOP, add_options, chosen_columns
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
+from piezo_control.start import interrupt_at_signals
 from piezo_sim.experiment.analysis import ANALYSES
 from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, not_covered, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
@@ -48,20 +49,24 @@ def main() -> int:
     arguments = parser().parse_args()
     console = Console(width=None if sys.stdout.isatty() else WIDTH_OF_LOGS)
     out = arguments.out or Path("out") / arguments.command
+    interrupt_at_signals()
     try:
-        arguments.run_command(arguments, out, console)
+        code = arguments.run_command(arguments, out, console)
     except (ParameterError, FileExistsError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return UNUSABLE
     except (RunFailed, BagError, OSError) as error:
         print(f"experiment: {error}", file=sys.stderr)
         return FAILED
+    except KeyboardInterrupt:
+        print("experiment: stopped", file=sys.stderr)
+        return FAILED
     if (out / "report.html").exists():
         console.print(f"report: {out / 'report.html'}", soft_wrap=True)
-    return DONE
+    return code
 
 
-def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -> None:
+def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -> int:
     """Run a named experiment and write metrics.json, plots and report."""
     title, cases = read_experiment(arguments.command, overrides(arguments))
     for case in cases:
@@ -70,6 +75,7 @@ def run_experiment(arguments: argparse.Namespace, out: Path, console: Console) -
         print(f"experiment: not covered by the certificate: {text}", file=sys.stderr)
     with results_folder(out, arguments.overwrite) as folder:
         run_into(folder, arguments, title, cases, console)
+    return DONE
 
 
 def run_into(
@@ -123,53 +129,78 @@ def run_all(
         from piezo_sim.experiment.on_nodes.runner import run_cases
 
         yield from run_cases(on_nodes, out, namespace, progress)
+        interrupt_at_signals()  # again: while nodes ran, a signal was for them
     for case in cases:
         if case.engine:
             yield run_on_engine(case, out, namespace, progress)
 
 
-def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> None:
-    """Analyse bags one by one."""
+def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> int:
+    """Analyse bags one by one; those that cannot be are named, and the others are done."""
     from piezo_sim.experiment.bags import analyse_bags
 
-    found = _analyse(arguments)
+    found, code = _analyse(arguments, least=1)
     with results_folder(out, overwrite=True) as folder:
         sections = analyse_bags(found, folder)
         write_html(folder / "report.html", "Analysis of recorded bags", sections)
     print_tables(console, sections)
+    return code
 
 
-def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> None:
-    """Compare bags in one plot and one table."""
+def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> int:
+    """Compare bags in one plot and one table; those that cannot be analysed are named and left out."""
     from piezo_sim.experiment.bags import compare_bags
 
-    found = _analyse(arguments)
-    if len(found) < 2:
-        raise ParameterError(f"compare needs two bags or more, not {len(found)}")
+    found, code = _analyse(arguments, least=2)
     with results_folder(out, overwrite=True) as folder:
         sections = compare_bags(found, folder)
         write_html(folder / "report.html", "Comparison of recorded bags", sections)
     print_tables(console, sections)
+    return code
 
 
-def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> None:
-    """Make a whole bag of what can be read of a cut one."""
+def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> int:
+    """Make whole bags of what can be read of cut ones; those of which nothing can be are named."""
     from piezo_control.recording.writer import recover
+    from piezo_sim.experiment.bags import told_apart
 
+    code, said = DONE, []
     with results_folder(out, overwrite=False) as folder:
-        for path in arguments.bags:
-            console.print(recover(path, folder / path.name), soft_wrap=True)
+        for name, path in told_apart(arguments.bags).items():
+            whole = Path(name).with_suffix("") if path.is_file() else Path(name)
+            try:
+                said.append(f"{recover(path, folder / whole)} written to {out / whole}")
+            except (
+                ValueError
+            ) as error:  # also of two files whose names differ in their suffixes alone
+                print(f"experiment: {error}", file=sys.stderr)
+                code = FAILED
+        if not said:
+            raise BagError("nothing was recovered")
+    for sentence in said:
+        console.print(sentence, soft_wrap=True, markup=False)
+    return code
 
 
-def _analyse(arguments: argparse.Namespace) -> dict[str, Any]:
-    from piezo_sim.experiment.bags import analysed
+def _analyse(arguments: argparse.Namespace, least: int) -> tuple[dict[str, Any], int]:
+    """Return the recordings that could be analysed, `least` or more, and the exit code."""
+    from piezo_sim.experiment.bags import analysed, told_apart
 
     a = arguments
-    found = analysed(a.bags, a.kind, a.finger, a.run, a.partial, *chosen_columns(arguments, LOOP))
+    given = len(told_apart(a.bags))
+    if given < least:
+        raise ParameterError(f"compare needs two bags or more, not {given}")
+    refused: list[BagError] = []
+    columns = chosen_columns(arguments, LOOP)
+    found = analysed(a.bags, a.kind, a.finger, a.run, a.partial, *columns, refused=refused)
     for name, one in found.items():
         if one.left_out:
             print(f"{name}: {one.left_out}")
-    return found
+    for error in refused:
+        print(f"experiment: left out: {error}", file=sys.stderr)
+    if len(found) < least:
+        raise BagError(f"{len(found)} of {given} recordings can be analysed")
+    return found, FAILED if refused else DONE
 
 
 def print_tables(console: Console, sections: Sequence[Section]) -> None:

@@ -123,6 +123,11 @@ def force(panels: Panels, path: Path) -> Path:
     return _disturbance(panels, path, "tip_force", "tip force [mN]", MN)
 
 
+def hold(panels: Panels, path: Path) -> Path:
+    """Draw a deflection over time beside the reference at which it is held."""
+    return step(panels, path)
+
+
 def errors(panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], path: Path) -> Path:
     """Draw errors (%) over time (s), a panel for each task and a line for each way to do it."""
     figure, axes = _panels(panels)
@@ -135,7 +140,18 @@ def errors(panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]], pa
 
 PLOTS: dict[str, Callable[[Panels, Path], Path]] = {
     plot.__name__: plot
-    for plot in (transient, creep, hysteresis, excite, feedforward, step, frequency, thermal, force)
+    for plot in (
+        transient,
+        creep,
+        hysteresis,
+        excite,
+        feedforward,
+        step,
+        frequency,
+        thermal,
+        force,
+        hold,
+    )  # fmt: skip
 }
 
 

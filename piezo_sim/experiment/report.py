@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from piezo_control.files import replaced
 from piezo_control.shared import version
 from piezo_sim.experiment.zoom import plot_file
 
@@ -84,9 +85,9 @@ def write_html(
         "has_metrics": (path.parent / "metrics.json").exists(),
         "script": _script() if any(f["plot"] for page in pages for f in page["figures"]) else "",
     }
-    path.write_text(
-        template.render(title=title, sections=pages, verdict=verdict, footer=footer, **origin)
-    )
+    text = template.render(title=title, sections=pages, verdict=verdict, footer=footer, **origin)
+    with replaced(path) as (place,):
+        place.write_text(text)
 
 
 def _plot(picture: Path) -> str:

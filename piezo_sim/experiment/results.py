@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from piezo_control.files import write_json
 from piezo_control.parameters import flatten, provenance
 from piezo_control.recording.recording import BagError, Recording, read
 from piezo_sim.experiment import plots
@@ -33,6 +33,7 @@ HEADINGS = {
     "frequency": "Frequency response (Fig. 14)",
     "thermal": "Change of the temperature while holding",
     "force": "Force on the tip while holding",
+    "hold": "Holding",
 }
 CAPTIONS = {
     "transient": "Deflection after a step of the voltage from rest.",
@@ -44,6 +45,7 @@ CAPTIONS = {
     "frequency": "Magnitude from the reference to the deflection.",
     "thermal": "Temperature, deflection from the value held before, and voltage.",
     "force": "Tip force, deflection from the value held before, and voltage.",
+    "hold": "Deflection where nothing is asked of it but to stay.",
 }
 DRIVEN_BY_VOLTAGE = ("transient", "creep", "hysteresis", "excite")
 LONGEST_ARRAY = 4  # that a report shows element by element
@@ -223,7 +225,7 @@ def metrics(results: Sequence[Result], out: Path) -> dict[str, Any]:
 
 def write_metrics(content: Mapping[str, Any], out: Path) -> None:
     """Write metrics.json to `out`."""
-    (out / "metrics.json").write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    write_json(out / "metrics.json", content)
 
 
 def footer(content: Mapping[str, Any], bags: int) -> str:

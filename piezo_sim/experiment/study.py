@@ -6,7 +6,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import itertools
-import json
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
+from piezo_control.files import write_json
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
 from piezo_sim.experiment.cases import RunFailed
@@ -41,20 +41,20 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
     """Do a study and show what it found; return the exit code: 0 done, 1 failed or stopped, 2 unusable input."""
     console = Console()
     out = arguments.out
+    name = out.resolve().name
     try:
         with results_folder(out, arguments.overwrite) as folder:
             found, sections = work(arguments, folder, console)
-            text = json.dumps(found, indent=2, ensure_ascii=False)
-            (folder / "metrics.json").write_text(text + "\n")
+            write_json(folder / "metrics.json", found)
             write_html(folder / "report.html", title, sections)
     except (ParameterError, FileExistsError) as error:
-        print(f"{out.name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return 2
     except (RunFailed, BagError, OSError) as error:
-        print(f"{out.name}: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"{out.name}: stopped; what was there before in {out} is unchanged", file=sys.stderr)
+        print(f"{name}: stopped; what was there before in {out} is unchanged", file=sys.stderr)
         return 1
     for section in sections:
         print_table(console, section)
@@ -64,26 +64,52 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
 
 @contextlib.contextmanager
 def results_folder(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a folder beside `out` for results, which take their place in `out` when all went well.
+    """Yield a new folder beside `out` for results, which take their place in `out` when all went well.
 
-    What is in `out` under other names stays. After a failure the folder is left as it is, for its logs and for the
-    bags of a run that was cut, which no later run deletes. Raises FileExistsError if `out` is a file, or holds
-    something and may not be replaced.
+    Recordings and files replace what has the same name; everything else in `out` stays. After a failure the folder
+    is left as it is and named, for its logs and for the bags of a run that was cut; no later run touches it. Raises
+    FileExistsError if `out` is a file, or holds something, also what came meanwhile, and may not be replaced.
     """
+    _need_room(out, overwrite)
+    place = out.resolve()
+    ends = itertools.chain([""], map("-{}".format, itertools.count(2)))
+    folders = (place.parent / f"{place.name}.unfinished{end}" for end in ends)
+    folder = next(folder for folder in folders if _is_made(folder))
+    try:
+        yield folder
+        _need_room(out, overwrite)
+        _put(folder, place)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # which only an empty one can be
+        if folder.exists():
+            print(f"{place.name}: what was done until then is in {folder}", file=sys.stderr)
+        raise
+
+
+def _need_room(out: Path, overwrite: bool) -> None:
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"--out is {out}, which is a file; name a folder")
     if out.exists() and any(out.iterdir()) and not overwrite:
         raise FileExistsError(f"{out} is not empty; name a new --out or give --overwrite")
-    ends = itertools.chain([""], map("-{}".format, itertools.count(2)))
-    folders = (out.with_name(f"{out.name}.unfinished{end}") for end in ends)
-    folder = next(folder for folder in folders if not (folder / "bags").exists())
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    yield folder
-    out.mkdir(exist_ok=True)
-    for made in folder.iterdir():
-        replaced = out / made.name
-        if replaced.is_dir():
-            shutil.rmtree(replaced)
-        made.replace(replaced)
-    folder.rmdir()
+
+
+def _is_made(folder: Path) -> bool:
+    """Make a folder that nobody else has; say whether that was possible."""
+    try:
+        folder.mkdir(parents=True)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _put(made: Path, place: Path) -> None:
+    """Move what was made to its place; a recording is replaced whole, any other folder entry by entry."""
+    if made.is_dir() and place.is_dir() and not (made / "metadata.yaml").exists():
+        for entry in made.iterdir():
+            _put(entry, place / entry.name)
+        made.rmdir()
+        return
+    if place.is_dir():
+        shutil.rmtree(place)
+    made.replace(place)

@@ -16,9 +16,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from piezo_control.nodes.base import ROS_TYPES
+from piezo_control.nodes.client import connect
 from piezo_control.nodes.profile_input import to_message
 from piezo_control.nodes.qos import LATCHED
-from piezo_control.parameters import declarations, flatten
+from piezo_control.parameters import ParameterError, declarations, flatten
 from piezo_control.profile import Profile
 from piezo_gripper_msgs.msg import FingerState, RecorderState
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
@@ -26,6 +27,23 @@ from piezo_sim.experiment.cases import RunFailed
 
 SERVICE_TIMEOUT = 20.0  # s
 SERVICE_RETRY = 1.0  # s
+DISCOVERY = 1.0  # s, in which the nodes that run become known
+
+
+def need_free(*namespaces: str, instead: str = "ROS_DOMAIN_ID") -> None:
+    """Refuse to start nodes where others run, for both would drive one finger; raise ParameterError naming them.
+
+    `instead` is what the user may name another one of.
+    """
+    with connect() as ros:
+        ros.closing.wait(DISCOVERY)
+        running = [node.rpartition("/") for node in ros.nodes()]
+    for namespace in namespaces:
+        names = [name for where, _, name in running if where == namespace]
+        if names:
+            raise ParameterError(
+                f"{namespace or '/'} has nodes already: {', '.join(names)}; end them, or name another {instead}"
+            )
 
 
 class Conductor:

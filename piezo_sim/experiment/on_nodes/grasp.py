@@ -28,6 +28,7 @@ from piezo_control.recording.recording import SAMPLE_TYPE, Recording, read
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
+from piezo_sim.experiment.on_nodes.conductor import need_free
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 from piezo_sim.experiment.plots import save
 from piezo_sim.experiment.report import Section
@@ -217,6 +218,7 @@ def work(
     arguments: argparse.Namespace, out: Path, console: Console
 ) -> tuple[dict[str, Any], list[Section]]:
     """Pick, hold, carry and place in every way that is asked for, and draw what came of it."""
+    need_free("", *(f"/{side}" for side in SIDES))
     runs = {}
     for name in arguments.ways:
         with console.status(f"{WAYS[name].title}: {CARRIED_UNTIL:g} s of two fingers"):

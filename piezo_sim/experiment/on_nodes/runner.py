@@ -15,7 +15,7 @@ from piezo_control.nodes import spin
 from piezo_control.start import stop_at_signals
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment.cases import NODES, Case, CaseRun, RunFailed, params_folder
-from piezo_sim.experiment.on_nodes.conductor import Conductor
+from piezo_sim.experiment.on_nodes.conductor import Conductor, need_free
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 STALL = 30.0  # s without a new sample after which a run is given up
@@ -31,12 +31,13 @@ def run_cases(
 ) -> Iterator[CaseRun]:
     """Run `cases` one after the other on the same node processes; bags go to `out`/bags.
 
-    Raises NodeDied when a node process ends, RunFailed when a run does not, Interrupted on SIGINT and
+    Raises ParameterError when others run in the namespace, NodeDied when a node process ends, RunFailed when a run does not, Interrupted on SIGINT and
     SIGTERM. Whatever happens, no process is left behind.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     discovery = params_folder() / "discovery.xml"
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(discovery))
+    need_free(f"/{namespace}", instead="--namespace")
     spin.init()
     stop = stop_at_signals()
     commands = {
