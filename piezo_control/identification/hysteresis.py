@@ -10,9 +10,10 @@ Control 9 (2003) 407). With slopes s_j over the segments v_j between fixed knots
 
 The lag of deflection behind voltage (amplifier, sensor) is identified along: plays would mimic it for
 the one amplitude and frequency recorded, and fail at every other. Offset and drift of the sensor are
-no part of the operator either. Neighbouring weights are held together by a smoothness penalty chosen
-by cross-validation over segments of the loop; for equal gaps and weights the operator then obeys
-Rayleigh's law, which is what extrapolates best to other amplitudes.
+no part of the operator either. Half a row is added to the lag's interval, for what is read between two
+rows. Neighbouring weights are held together by a smoothness penalty chosen by cross-validation over
+segments of the loop; for equal gaps and weights the operator then obeys Rayleigh's law, which is what
+extrapolates best to other amplitudes.
 """
 
 from __future__ import annotations
@@ -227,15 +228,18 @@ class _Problem:
         )
 
     def search_lag(self) -> float:
-        """Return the lag (s) with the least deviation in cross-validation, 0 if it gains too little."""
+        """Return the lag (s) with the least deviation in cross-validation, 0 if its whole rows gain too little."""
         few = slice(None, None, -(-len(self.rows) // LAG_ROWS))
 
-        def deviation(lag: float) -> float:
-            return min(self.cross_validation(self.parts(lag, few), LAG_SMOOTHNESS)) ** 0.5
+        def deviation(lag: float, chosen: slice = few) -> float:
+            return min(self.cross_validation(self.parts(lag, chosen), LAG_SMOOTHNESS)) ** 0.5
 
         longest = 0.05 * self.period()
-        best = minimize_scalar(deviation, bounds=(0.0, longest), method="bounded")
-        return float(best.x) if best.fun < (1.0 - LAG_GAIN) * deviation(0.0) else 0.0
+        best = minimize_scalar(deviation, bounds=(0.0, longest), method="bounded").x
+        # Readings between two rows are means, with less noise, and few rows miss a spike: neither is a lag.
+        step = self.measurement.sample_time
+        before, after = (deviation(lag, slice(None)) for lag in (0.0, step * round(best / step)))
+        return float(best) if after < (1.0 - LAG_GAIN) * before else 0.0
 
     def period(self) -> float:
         """Return the time (s) between passages of the voltage through its middle, twice the median."""
@@ -306,13 +310,19 @@ class _Problem:
                     found[f"hysteresis.{name}"] = getattr(parameters, name)
             return {**found, "offset": offset, **({"lag": float(numbers[-1])} if searched else {})}
 
-        return intervals(
-            values,
-            np.append(x, lag),
-            jacobian,
-            equations @ full,
-            np.column_stack((rows, 0.0 * rows[:, :1])),
+        widths = dict(
+            intervals(
+                values,
+                np.append(x, lag),
+                jacobian,
+                equations @ full,
+                np.column_stack((rows, 0.0 * rows[:, :1])),
+            )
         )
+        if searched:
+            # That means have less noise draws the lag to the middle between two rows, by half a row at most.
+            widths["lag"] += 0.5 * step
+        return widths
 
     def _operator(self, x: NDArray[np.float64]) -> tuple[HysteresisParameters, float]:
         """Return to SI units, and move the dead zones' origin to where the plays sum to 0; the offset, too."""
