@@ -25,6 +25,7 @@ P. Lutz, IEEE T-ASE 7 (2010) 440 (on piezocantilevers).
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 from collections.abc import Sequence
@@ -36,7 +37,7 @@ from scipy.optimize import linprog
 
 from piezo_control.parameters import ParameterError, parameter
 
-LONGEST = 200  # samples
+LONGEST = 1000  # samples, a period of 10 Hz at 10 kHz: each tap costs the loop time in every sample
 DIRECTIONS = 48  # of the polygon that stands for the circle |V| <= bound
 MARGIN = math.cos(math.pi / DIRECTIONS)
 GRID = 25  # resonances across the box
@@ -157,7 +158,10 @@ def _least_time(
     frequencies = np.repeat(frequency * factors, 3)
     dampings = damping * np.tile([1.0 - p.damping_spread, 1.0, 1.0 + p.damping_spread], GRID)
     turns = np.exp(2j * np.pi * np.arange(DIRECTIONS) / DIRECTIONS)
-    for count in range(2, LONGEST + 1):
+
+    @functools.cache
+    def best(count: int) -> list[float] | None:
+        """Return so many taps that keep the bound, None where there are none."""
         phasors = _phasors(count, frequencies, np.minimum(dampings, 0.999), sample_time)
         vibration = (turns[:, None, None] * phasors).real.reshape(-1, count)
         # Unknowns: the taps, and the largest V, which is to be small.
@@ -169,8 +173,16 @@ def _least_time(
             b_eq=[1.0],
             bounds=[(0.0, p.largest_tap)] * count + [(0.0, None)],
         )
-        if found.success and found.fun <= p.residual * MARGIN:
-            return found.x[:-1].tolist()
+        is_kept = found.success and found.fun <= p.residual * MARGIN
+        return found.x[:-1].tolist() if is_kept else None
+
+    # A shaper with a tap of 0 in front leaves the same: where a count suffices, every larger one does.
+    enough = min(math.ceil(1.0 / (frequency * sample_time)), LONGEST)
+    while best(enough) is None and enough < LONGEST:
+        enough = min(2 * enough, LONGEST)
+    fewest = bisect.bisect_left(range(enough), True, lo=2, key=lambda n: best(n) is not None)
+    if taps := best(fewest):
+        return taps
     raise ParameterError(
         f"'residual' is {p.residual}: no shaper up to {LONGEST} samples leaves so little for a spread of "
         f"{p.spread}"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hysteresis from recordings: known weights come back, and a measured actuator is described."""
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,55 @@ def test_lag_and_offset_are_told_from_the_hysteresis():
 def test_no_lag_is_found_where_there_is_none():
     truth = HysteresisParameters()
     assert identify_hysteresis(recorded(truth, 1e-3), truth.thresholds).lag == 0.0
+
+
+def stack(phase, lag=0.0, spikes=()):
+    """A stack of 0 to 150 V, 1 kHz, 5 nm of noise, between thresholds that are none of the fit's equal ones."""
+    time = np.arange(len(phase)) * 1e-3
+    voltage = 75.0 * (1.0 - phase)
+    operator = HysteresisParameters(
+        (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0),
+        (6e-8, 1.2e-8, 1e-8, 8e-9, 6e-9, 5e-9, 4e-9),
+    )
+    late = np.interp(time - lag, time, deflection_history(operator, voltage))
+    readings = late + 5e-9 * np.random.default_rng(13).standard_normal(len(time))
+    readings[list(spikes)] += 5e-6
+    return Measurement("stack", time, voltage, readings, None, None, np.arange(len(time)))
+
+
+COSINE = np.cos(2e-3 * np.pi * np.arange(10_000))
+TRIANGLE = 2.0 * np.abs(np.arange(4000) / 1000.0 % 2.0 - 1.0) - 1.0
+SINE = 1.0 - np.sin(2e-3 * np.pi * np.arange(8000)) * np.linspace(1.0, 0.1, 8000)
+
+
+@pytest.mark.parametrize(
+    ("phase", "spikes"),
+    [(COSINE, ()), (TRIANGLE, ()), (SINE, (1501, 2501, 3334, 4445))],
+    ids=["one amplitude", "triangle", "spikes"],
+)
+def test_means_between_two_rows_are_not_taken_for_a_lag(phase, spikes):
+    """They halve the noise, or fewer rows miss a spike; here nothing lags."""
+    measurement = stack(phase, spikes=spikes)
+    assert identify_hysteresis(measurement, equal_thresholds(measurement, 20), 3).lag == 0.0
+
+
+@pytest.mark.parametrize("lag", [1e-3, 3e-3, 8e-3])
+def test_the_interval_of_a_lag_holds_it(lag):
+    measurement = stack(COSINE, lag)
+    model = identify_hysteresis(measurement, equal_thresholds(measurement, 20), 3)
+    assert model.lag == pytest.approx(lag, abs=model.confidence["lag"])
+    assert model.confidence["lag"] < 0.6e-3
+
+
+def test_three_hundred_thresholds_take_seconds():
+    """Bounded least squares used to take minutes of a processor for them; they leave no more than the noise, 5 nm."""
+    measurement = stack(SINE)
+    begin = time.process_time()
+    model = identify_hysteresis(measurement, equal_thresholds(measurement, 300), 3)
+    assert time.process_time() - begin < 20.0
+    fitted = slice(settled(measurement), None)
+    modelled = model.deflection(measurement.time, measurement.voltage)
+    assert quality(measurement.deflection[fitted], modelled[fitted]).rms < 5.5e-9
 
 
 def test_dead_zones_come_back_where_the_fit_has_its_knots():
@@ -178,3 +228,11 @@ def test_unusable_thresholds_are_refused(p885, thresholds, error, message):
 def test_too_little_data_is_refused(p885):
     with pytest.raises(MeasurementError, match="100 samples are left to fit 22 numbers"):
         identify_hysteresis(p885, equal_thresholds(p885, 20), first=400, last=500)
+
+
+def test_a_deflection_that_does_not_move_where_it_is_fitted_is_refused():
+    time = np.arange(400) * 0.01
+    step = np.where(time < 1.0, 0.0, 10.0)
+    measurement = Measurement("step", time, step, step, None, None, np.arange(400))
+    with pytest.raises(MeasurementError, match="'voltage' is 10 in all rows 100 to 399"):
+        identify_hysteresis(measurement, (0.0, 1.0), lag=0.0)

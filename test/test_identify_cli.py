@@ -352,6 +352,45 @@ def test_a_reversed_sensor_is_found_in_every_step(identify, tmp_path, capsys):
     assert identify("dynamics", stepped, "--reversed") == 0
 
 
+@pytest.mark.parametrize("slip, code", [(0.0, 0), (1.0, 2)], ids=["noise", "a step"])
+def test_a_voltage_may_move_as_far_as_it_does_not_move_the_finger(
+    identify, tmp_path, capsys, slip, code
+):
+    """1 mV of a voltmeter's noise is 0.6 nm of 3 µm; 1 V with the force is 0.6 µm, a fifth, at the paper's 0.6 µm/V."""
+    time = np.arange(2000) * 2e-4
+    force = np.where(time < 0.02, 0.0, 1.0)  # mN
+    ringing = DynamicsModel(2.0 * np.pi * 300.0, 0.05, 3.0, 0.0, 0.0, 0).deflection(time, force)
+    voltage = slip * force + 1e-3 * np.random.default_rng(8).standard_normal(2000)
+    pushed = table(tmp_path / "push.csv", voltage, ringing, force, rate=5e3)
+    assert identify("stiffness", pushed) == code
+    if code:
+        assert "must be at most 1 %: hold the voltage" in capsys.readouterr().err
+    else:
+        found = load(tmp_path / "identified" / "cantilever.yaml", "cantilever")
+        assert found["dynamics.elastic_constant"] == pytest.approx(3e-3, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "skip", "message"),
+    [
+        ("{lag: 0.0, offset: 0.0}", 99999, "a.csv: 0 samples, must be at least 50"),
+        ("{lag: 0.0, offset: 0.0}", 1960, "a.csv: 40 samples, must be at least 50"),
+        ("{offset: 0.0}", 0, "identification.yaml: no 'lag', which `identify hysteresis` writes"),
+        ("{lag: late, offset: 0.0}", 0, "identification.yaml: 'lag' is 'late', must be of type float"),
+        ("{lag: .inf, offset: 0.0}", 0, "identification.yaml: 'lag' is inf, must be in [-1000, 1000] s"),
+    ],
+)  # fmt: skip
+def test_what_a_check_cannot_use_is_named(identify, tmp_path, capsys, sensor, skip, message):
+    out = tmp_path / "identified"
+    out.mkdir()
+    (out / "feedforward.yaml").write_text(
+        "/**/feedforward: {ros__parameters: {static_gain: 5e-7}}\n"
+    )
+    (out / "identification.yaml").write_text(f"/**/identification: {{ros__parameters: {sensor}}}\n")
+    assert identify("check", table(tmp_path / "a.csv", LOOP, PAPERS), "--skip", skip) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_only_the_asked_part_of_a_recording_is_used(identify, tmp_path):
     """From 5 to 25 s of the p885 recording: 4000 rows."""
     assert identify("hysteresis", P885, *P885_COLUMNS, "--start", 5, "--end", 25) == 0

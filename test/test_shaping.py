@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shapers against the mode that they are for, stepped exactly."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -80,6 +82,28 @@ def test_least_time_keeps_its_bound_over_the_box_and_is_shorter_than_2_ms(larges
     frequency = np.linspace(0.9, 1.1, 301)[:, None] / (2.0 * np.pi * np.sqrt(A2))
     ratio = np.linspace(0.5, 1.5, 7) * 0.5 * A1 / np.sqrt(A2)
     assert np.max(residual_vibration(taps, frequency, ratio, H)) <= 0.05
+
+
+@pytest.mark.parametrize(
+    "hertz, sample_time, count", [(1000.0, H, 12), (200.0, H, 47), (100.0, H, 91)]
+)
+def test_no_count_below_the_fewest_suffices(hertz, sample_time, count):
+    """The counts that linear programs at 2, 3, 4, ... taps find, one after the other."""
+    omega = 2.0 * np.pi * hertz
+    mode = (1.0 / omega**2, 2.0 * 0.02 / omega, 1.0)
+    assert len(shaper(ShapingParameters(), mode, sample_time)) == count
+
+
+@pytest.mark.parametrize("hertz", [50.0, 20.0])
+def test_a_slow_finger_is_shaped_within_seconds_of_a_processor(hertz):
+    """At 10 kHz; one after the other, the linear programs took 46 s for 50 Hz, and 20 Hz was refused."""
+    omega = 2.0 * np.pi * hertz
+    begin = time.process_time()
+    taps = shaper(ShapingParameters(), (1.0 / omega**2, 2.0 * 0.02 / omega, 1.0), H)
+    assert time.process_time() - begin < 20.0
+    frequency = np.linspace(0.9, 1.1, 301)[:, None] * hertz
+    worst = residual_vibration(taps, frequency, np.linspace(0.01, 0.03, 7), H)
+    assert np.max(worst) <= 0.05
 
 
 def test_a_ramp_comes_late_by_the_delay():

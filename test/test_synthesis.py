@@ -11,7 +11,7 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from piezo_control.design import hinf
@@ -237,10 +237,37 @@ def test_any_weights_end_in_a_controller_or_an_explanation(effort, disturbance, 
         assert design.gamma > 0.0
 
 
+COEFFICIENTS = st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=4).map(tuple)
+
+
+@settings(max_examples=100, deadline=None)
+@given(numerator=COEFFICIENTS, denominator=COEFFICIENTS)
+@example(numerator=(0.3,), denominator=(1.0,))
+@example(numerator=(0.0,), denominator=(1.0, 0.0))
+@example(numerator=(1.0, 0.0), denominator=(1.0, 1.0, 0.0))  # s / (s (s + 1))
+@example(numerator=(1.0, 2.0), denominator=(1.0, 2.0, 1.0))
+def test_any_given_controller_ends_in_a_law_or_an_explanation(numerator, denominator):
+    try:
+        given = TransferFunction(numerator, denominator)
+        law = synthesize(DesignProblem(method="given", controller=given)).controller
+    except (ParameterError, SynthesisError) as error:
+        assert len(str(error)) > 30
+    else:
+        assert np.all(np.isfinite([*law.a, *law.b, *law.c, *law.anti_windup]))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"method": "given"}, "'controller' must be given"),
+        (
+            {"method": "given", "controller": TransferFunction((0.3,), (1.0,))},
+            r"'controller' is \(0.3,\) / \(1.0,\), must have .* a pole",
+        ),
+        (
+            {"method": "given", "controller": TransferFunction((0.0,), (1.0, 0.0))},
+            r"'controller' is \(0.0,\) / .* must have a numerator that is not 0",
+        ),
         ({"method": "pid", "weights": REGULAR}, "'weights' are for method 'hinf'"),
     ],
 )

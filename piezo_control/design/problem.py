@@ -161,7 +161,7 @@ class Weights:
 class Prefilter:
     """Second-order low-pass between reference and loop; frequency 0: none."""
 
-    frequency: float = parameter(0.0, "natural frequency", unit="rad/s", low=0.0)
+    frequency: float = parameter(0.0, "natural frequency", unit="rad/s", low=0.0, high=1e7)
     damping: float = parameter(0.7, "damping ratio", low=0.1, high=10.0)
 
 
@@ -200,5 +200,11 @@ class DesignProblem:
     def __post_init__(self) -> None:
         if (self.method == "given") != bool(self.controller):
             raise ParameterError("'controller' must be given with method 'given' and only there")
+        c = self.controller
+        if c and (len(c.denominator) < 2 or not any(c.numerator)):
+            raise ParameterError(
+                f"'controller' is {c.numerator} / {c.denominator}, must have a numerator that is not 0 "
+                "and a pole: its slowest pole is the integrator"
+            )
         if self.method != "hinf" and self.weights:
             raise ParameterError(f"'weights' are for method 'hinf', not for '{self.method}'")

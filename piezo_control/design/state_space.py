@@ -18,6 +18,7 @@ import scipy.signal
 from piezo_control.design.problem import SynthesisError, TransferFunction
 
 TIME_UNIT = 1e-3
+WIDEST = 1e50  # ratio of coefficients: squares of it are squared again
 
 
 class StateSpace(NamedTuple):
@@ -65,7 +66,14 @@ def realise(transfer: TransferFunction) -> StateSpace:
     if order == 0:  # tf2ss would invent an integrator
         gain = np.array([[transfer.numerator[0] / transfer.denominator[0]]])
         return StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), gain)
-    return StateSpace(*scipy.signal.tf2ss(scaled(transfer.numerator), scaled(transfer.denominator)))
+    numerator, denominator = scaled(transfer.numerator), scaled(transfer.denominator)
+    sizes = np.abs(np.concatenate((numerator, denominator)))
+    if sizes.max() > WIDEST * sizes[sizes > 0.0].min():
+        raise SynthesisError(
+            f"the coefficients of {transfer.numerator} / {transfer.denominator} are more than a factor of "
+            f"{WIDEST:g} apart, in rad/ms: beyond what the design computes with"
+        )
+    return StateSpace(*scipy.signal.tf2ss(numerator, denominator))
 
 
 def balanced(system: StateSpace, order: int = 0) -> StateSpace:
@@ -88,8 +96,13 @@ def balanced(system: StateSpace, order: int = 0) -> StateSpace:
             "would run away at the command's limit: ask for less bandwidth"
         )
     mode, dual = right[:, slow].real, left[:, slow].real
-    b_slow = dual @ system.b / (dual @ mode)
     c_slow = system.c @ mode
+    if (dual @ mode) * (dual @ system.b)[0] * c_slow[0] == 0.0:
+        raise SynthesisError(
+            f"the controller's slowest pole, {poles[slow].real / TIME_UNIT:.4g} rad/s, is double or cancelled by "
+            "a zero, must be neither: it is the integrator"
+        )
+    b_slow = dual @ system.b / (dual @ mode)
     ratio = math.sqrt(abs(b_slow[0] / c_slow[0]))
     # Coordinates of the other modes: an orthonormal basis of the invariant subspace dual'x = 0.
     basis = scipy.linalg.null_space(dual[None, :])

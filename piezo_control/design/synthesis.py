@@ -76,7 +76,13 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
         a[0, :] = 0.0
         a[:, 0] = 0.0
         a[0, 0] = 1.0
-    spread = scipy.linalg.solve_discrete_are(a.T, c.T, b @ b.T, [[ANTI_WINDUP_NOISE]])
+    try:
+        spread = scipy.linalg.solve_discrete_are(a.T, c.T, b @ b.T, [[ANTI_WINDUP_NOISE]])
+    except ValueError as error:  # LinAlgError, too
+        raise SynthesisError(
+            f"the controller has no anti-windup gain ({error}): a zero must neither cancel its slowest "
+            "pole nor come so near that double precision does not tell them apart"
+        ) from None
     anti_windup = a @ spread @ c.T / (ANTI_WINDUP_NOISE + c @ spread @ c.T)
     filtered = realise(prefilter_transfer(problem.prefilter))
     filtered = from_w_plane(filtered, problem.finger.sample_time / TIME_UNIT)

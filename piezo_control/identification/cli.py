@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from piezo_control.identification.dynamics import (
     identify_dynamics,
     need_vibration,
 )
-from piezo_control.identification.fit import FitQuality, need, quality, straight
+from piezo_control.identification.fit import FitQuality, need, noise, quality, straight
 from piezo_control.identification.hysteresis import (
     HysteresisModel,
     equal_thresholds,
@@ -53,7 +53,15 @@ from piezo_control.identification.measurement import (
     read_measurement,
 )
 from piezo_control.options import within
-from piezo_control.parameters import ParameterError, build, dump, flatten, load
+from piezo_control.parameters import (
+    ParameterError,
+    build,
+    declarations,
+    dump,
+    flatten,
+    load,
+    parameter,
+)
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters
 
@@ -69,6 +77,16 @@ LIMITS_COMMENT = """The limits of the voltage are no result of a measurement: th
 your actuator stands."""
 SENSOR_COMMENT = """The deflection shows lag seconds late and with the offset of the sensor; both are no part of the
 operator, and the feedforward does not use them. For `identify check`."""
+LARGEST_SHARE_OF_VOLTAGE = 0.01
+"""Of a deflection under a tip force: so much the voltage may move, which the elastic constant takes for its own."""
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """What a sensor shows besides the operator's deflection."""
+
+    lag: float = parameter(0.0, "lag of the deflection", unit="s", low=-1e3, high=1e3)
+    offset: float = parameter(0.0, "shown where the operator says 0", unit="m")
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -180,9 +198,10 @@ def check(arguments: argparse.Namespace, console: Console) -> list[Path]:
     measurement = read(arguments.recording, arguments)
     path = arguments.out / "feedforward.yaml"
     operator = stored_hysteresis(path)
-    sensor = load(arguments.out / "identification.yaml", "identification")
-    model = HysteresisModel(operator, sensor["offset"], sensor["lag"], 0.0)
+    sensor = stored_sensor(arguments.out)
+    model = HysteresisModel(operator, sensor.offset, sensor.lag, 0.0)
     samples = slice(arguments.skip or 0, None)
+    measurement.part(samples).need_varying("voltage", "deflection")
     modelled = model.deflection(measurement.time, measurement.voltage)
     modelled += np.mean((measurement.deflection - modelled)[samples])
     fit = quality(measurement.deflection[samples], modelled[samples])
@@ -207,9 +226,16 @@ def stiffness(arguments: argparse.Namespace, console: Console) -> list[Path]:
     """Identify the elastic constant from a step of the tip force; update cantilever.yaml."""
     measurement = read(arguments.recording, arguments).bridged()
     measurement.need_varying("tip_force")
-    if np.ptp(measurement.voltage) > 0.0:
-        k = int(np.flatnonzero(measurement.voltage != measurement.voltage[0])[0])
-        raise measurement.error("voltage", k, "must be constant while the tip force changes")
+    slope = sum(operator_of(arguments, console).weights)
+    voltage, deflection = measurement.voltage, measurement.deflection
+    # Noise of a voltmeter moves nothing; what is left of it moves the finger.
+    moved = slope * np.sqrt(max(np.var(voltage) - noise(voltage) ** 2, 0.0))
+    if moved > LARGEST_SHARE_OF_VOLTAGE * np.std(deflection):
+        raise MeasurementError(
+            f"{measurement.source}: column 'voltage' goes from {voltage.min():.4g} to {voltage.max():.4g} V while the "
+            f"tip force changes: at {slope:.3g} m/V that is {100.0 * moved / np.std(deflection):.2g} % of the "
+            f"deflection's deviation, must be at most {100.0 * LARGEST_SHARE_OF_VOLTAGE:g} %: hold the voltage"
+        )
     return finish_dynamics(
         "stiffness", measurement, measurement.tip_force, [], None, arguments, console
     )
@@ -326,11 +352,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     From a loop among them that was recorded at 22 degC the operator is identified once more, without the creep.
     """
     stored = arguments.out / "feedforward.yaml"
-    operator = HysteresisParameters()
-    if stored.exists():
-        operator = stored_hysteresis(stored)
-    else:
-        console.print(f"no {stored}: the hysteresis is taken as that of the paper's finger")
+    operator = operator_of(arguments, console)
     measurements = [read(path, arguments).bridged() for path in arguments.recording]
     model = identify_drift(measurements, operator)
     fits = {
@@ -360,7 +382,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     written = store(arguments.out, "drift", comment, groups) if groups else []
     loop = next(filter(is_cold_loop, measurements), None)
     if loop and stored.exists():
-        lag = load(arguments.out / "identification.yaml", "identification")["lag"]
+        lag = stored_sensor(arguments.out).lag
         dead_zones = len(operator.upper_thresholds)
         fresh = identify_hysteresis(model.cleared(loop), operator.thresholds, dead_zones, lag)
         comment = f"hysteresis: without this creep, identified once more from {loop.source}"
@@ -413,11 +435,30 @@ def read(path: Path, arguments: argparse.Namespace) -> Measurement:
     return measurement.part(slice(int(begin), int(end)))
 
 
+def operator_of(arguments: argparse.Namespace, console: Console) -> HysteresisParameters:
+    """Return the operator in --out, or the paper's, and say so."""
+    stored = arguments.out / "feedforward.yaml"
+    if stored.exists():
+        return stored_hysteresis(stored)
+    console.print(f"no {stored}: the hysteresis is taken as that of the paper's finger")
+    return HysteresisParameters()
+
+
 def stored_hysteresis(path: Path) -> HysteresisParameters:
     """Return the operator in a parameter file of the feedforward node."""
     values = load(path, "feedforward")
     operator = {n: value for n, value in values.items() if n.startswith("hysteresis.")}
     return build(FeedforwardParameters, operator, str(path)).hysteresis
+
+
+def stored_sensor(folder: Path) -> SensorParameters:
+    """Return what `hysteresis` wrote of the sensor."""
+    path = folder / "identification.yaml"
+    values = load(path, "identification")
+    for name in declarations(SensorParameters):
+        if name not in values:
+            raise ParameterError(f"{path}: no '{name}', which `identify hysteresis` writes")
+    return build(SensorParameters, values, str(path))
 
 
 def said(name: str, source: str, found: Values, confidence: Values) -> str:

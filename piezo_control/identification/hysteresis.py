@@ -10,9 +10,10 @@ Control 9 (2003) 407). With slopes s_j over the segments v_j between fixed knots
 
 The lag of deflection behind voltage (amplifier, sensor) is identified along: plays would mimic it for
 the one amplitude and frequency recorded, and fail at every other. Offset and drift of the sensor are
-no part of the operator either. Neighbouring weights are held together by a smoothness penalty chosen
-by cross-validation over segments of the loop; for equal gaps and weights the operator then obeys
-Rayleigh's law, which is what extrapolates best to other amplitudes.
+no part of the operator either. Half a row is added to the lag's interval, for what is read between two
+rows. Neighbouring weights are held together by a smoothness penalty chosen by cross-validation over
+segments of the loop; for equal gaps and weights the operator then obeys Rayleigh's law, which is what
+extrapolates best to other amplitudes.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import lsq_linear, minimize_scalar
+from scipy.optimize import minimize_scalar, nnls
 
 from piezo_control.hysteresis import (
     Coefficients,
@@ -39,6 +40,7 @@ SMOOTHNESS = (0.0, *np.logspace(-4.0, 1.0, 11).tolist())
 FOLDS = 5
 FAR = 1e3  # strokes from the middle: beyond any deflection
 LAG_ROWS = 4000  # rows used while searching the lag
+LAG_PLAYS = 60  # and so many thresholds, of more every second, third, ...
 LAG_SMOOTHNESS = (3e-4, 0.01, 0.3, 10.0)
 LAG_GAIN = 0.02  # relative, of the deviation: a lag that gains less is not believed
 MOST_ROWS = 200_000  # rows used in a fit; of longer measurements every second, third, ...
@@ -99,7 +101,7 @@ def identify_hysteresis(
     Raises
     ------
     MeasurementError
-        If voltage or deflection is constant, a threshold lies beyond the voltages or too little is left
+        If voltage or deflection is constant where it is fitted, a threshold lies beyond the voltages or too little is left
         to fit.
     ParameterError
         If the thresholds do not increase from 0.
@@ -121,10 +123,12 @@ def identify_hysteresis(
             f"numbers, must be at least {10 * unknowns}; voltage at both ends from row "
             f"{measurement.rows[settled(measurement)]}"
         )
-    problem = _Problem(measurement, thresholds, dead_zones, first, last)
+    measurement.part(slice(first, last)).need_varying("voltage", "deflection")
     searched = lag is None
     if lag is None:
-        lag = problem.search_lag()
+        few = thresholds[:: -(-len(thresholds) // LAG_PLAYS)]
+        lag = _Problem(measurement, few, dead_zones, first, last).search_lag()
+    problem = _Problem(measurement, thresholds, dead_zones, first, last)
     return problem.solve(lag, searched and lag > 0.0)
 
 
@@ -217,7 +221,20 @@ class _Problem:
 
     def least_squares(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the bounded solution of ``rows[:, :-1] x = rows[:, -1]``."""
-        return lsq_linear(rows[:, :-1], rows[:, -1], (self.lowest(), np.inf), method="bvls").x
+        lowest = self.lowest()
+        free, bounded = np.flatnonzero(np.isinf(lowest)), np.flatnonzero(np.isfinite(lowest))
+        shifted = rows[:, -1] - rows[:, bounded] @ lowest[bounded]
+        # Free unknowns first: below their rows the triangular factor has the bounded ones alone.
+        triangle = np.linalg.qr(
+            np.column_stack((rows[:, free], rows[:, bounded], shifted)), mode="r"
+        )
+        n = len(free)
+        above = nnls(triangle[n:, n:-1], triangle[n:, -1])[0]
+        x = lowest.copy()
+        x[bounded] += above
+        left = triangle[:n, -1] - triangle[:n, n:-1] @ above
+        x[free] = np.linalg.lstsq(triangle[:n, :n], left, rcond=None)[0]
+        return x
 
     def lowest(self) -> NDArray[np.float64]:
         """Return the lower bounds of weights, offset, drift and slopes."""
@@ -227,15 +244,18 @@ class _Problem:
         )
 
     def search_lag(self) -> float:
-        """Return the lag (s) with the least deviation in cross-validation, 0 if it gains too little."""
+        """Return the lag (s) with the least deviation in cross-validation, 0 if its whole rows gain too little."""
         few = slice(None, None, -(-len(self.rows) // LAG_ROWS))
 
-        def deviation(lag: float) -> float:
-            return min(self.cross_validation(self.parts(lag, few), LAG_SMOOTHNESS)) ** 0.5
+        def deviation(lag: float, chosen: slice = few) -> float:
+            return min(self.cross_validation(self.parts(lag, chosen), LAG_SMOOTHNESS)) ** 0.5
 
         longest = 0.05 * self.period()
-        best = minimize_scalar(deviation, bounds=(0.0, longest), method="bounded")
-        return float(best.x) if best.fun < (1.0 - LAG_GAIN) * deviation(0.0) else 0.0
+        best = minimize_scalar(deviation, bounds=(0.0, longest), method="bounded").x
+        # Readings between two rows are means, with less noise, and few rows miss a spike: neither is a lag.
+        step = self.measurement.sample_time
+        before, after = (deviation(lag, slice(None)) for lag in (0.0, step * round(best / step)))
+        return float(best) if after < (1.0 - LAG_GAIN) * before else 0.0
 
     def period(self) -> float:
         """Return the time (s) between passages of the voltage through its middle, twice the median."""
@@ -256,15 +276,13 @@ class _Problem:
         self, parts: list[NDArray[np.float64]], smoothness: Sequence[float]
     ) -> list[float]:
         """Return, for each smoothness, the squared deviation of every fold fitted on the others."""
-        errors = []
-        for value in smoothness:
-            penalty = self.penalty(value)
-            error = 0.0
-            for k, held_back in enumerate(parts):
-                x = self.least_squares(np.concatenate((*parts[:k], *parts[k + 1 :], penalty)))
-                error += float(np.sum((held_back @ np.append(x, -1.0)) ** 2))
-            errors.append(error)
-        return errors
+        errors = np.zeros(len(smoothness))
+        for k, held_back in enumerate(parts):
+            others = np.linalg.qr(np.concatenate((*parts[:k], *parts[k + 1 :])), mode="r")
+            for i, value in enumerate(smoothness):
+                x = self.least_squares(np.concatenate((others, self.penalty(value))))
+                errors[i] += np.sum((held_back @ np.append(x, -1.0)) ** 2)
+        return errors.tolist()
 
     def solve(self, lag: float, searched: bool) -> HysteresisModel:
         """Choose the smoothness by cross-validation, solve, and return to SI units."""
@@ -306,13 +324,17 @@ class _Problem:
                     found[f"hysteresis.{name}"] = getattr(parameters, name)
             return {**found, "offset": offset, **({"lag": float(numbers[-1])} if searched else {})}
 
-        return intervals(
+        widths = intervals(
             values,
             np.append(x, lag),
             jacobian,
             equations @ full,
             np.column_stack((rows, 0.0 * rows[:, :1])),
         )
+        if not searched:
+            return widths
+        # That means have less noise draws the lag to the middle between two rows, by half a row at most.
+        return {**widths, "lag": np.add(widths["lag"], 0.5 * step).item()}
 
     def _operator(self, x: NDArray[np.float64]) -> tuple[HysteresisParameters, float]:
         """Return to SI units, and move the dead zones' origin to where the plays sum to 0; the offset, too."""
