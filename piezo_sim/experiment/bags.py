@@ -161,7 +161,7 @@ def compare_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
         rows |= {f"{name} {of}".strip(): figures for of, figures in one.figures.items()}
         here, there = len(one.figures), len(found[first].figures)
         if here != there:
-            rows[f"  {name} − {first}: none, it has {here} steps and not {there}"] = {}
+            rows[f"  {name} − {first}: none, steps: {here} and {there}"] = {}
         elif name != first:
             pairs = zip(one.figures.items(), found[first].figures.values())
             rows |= {

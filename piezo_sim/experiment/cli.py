@@ -170,9 +170,8 @@ def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> i
             whole = Path(name).with_suffix("") if path.is_file() else Path(name)
             try:
                 said.append(f"{recover(path, folder / whole)} written to {out / whole}")
-            except (
-                ValueError
-            ) as error:  # also of two files whose names differ in their suffixes alone
+            except ValueError as error:
+                # Of what is no bag, and of a second one of this name, as are x.mcap and x.db3.
                 print(f"experiment: {error}", file=sys.stderr)
                 code = FAILED
         if not said:
