@@ -148,7 +148,7 @@ def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> i
 
 
 def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> int:
-    """Compare bags in one plot and one table; those that cannot be analysed are named and left out."""
+    """Compare bags in one plot and one table, without those that cannot be analysed."""
     from piezo_sim.experiment.bags import compare_bags
 
     found, code = _analyse(arguments, least=2)
