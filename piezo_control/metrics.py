@@ -147,8 +147,8 @@ def ringing(time: ArrayLike, value: ArrayLike, least: float = 0.05) -> Ringing:
 def drift(time: ArrayLike, value: ArrayLike, begin: float, average: float) -> float:
     """Return the change of `value` from time[0] + `begin` to the end, in its unit: creep.
 
-    Both are means over `average` seconds: the ones that follow `begin`, and the last ones. Raises ValueError when the
-    record is not longer than that.
+    Both are means over `average` seconds: the ones that follow `begin`, and the last ones.
+    Raises ValueError when the record is not longer than that.
     """
     time = np.asarray(time, dtype=float)
     value = np.asarray(value, dtype=float)

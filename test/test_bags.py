@@ -245,7 +245,7 @@ def test_a_figure_that_one_recording_lacks_has_no_difference(tmp_path):
 def test_why_recordings_of_other_steps_are_not_subtracted_is_said(tmp_path):
     found = analysed([session(tmp_path / "a"), session(tmp_path / "b", first=100)])
     section, _ = compare_bags(found, tmp_path)
-    assert section.rows[-1][0] == "  b − a: none, it has 2 steps and not 3"
+    assert section.rows[-1][0] == "  b − a: none, steps: 2 and 3"
     assert set(section.rows[-1][1:]) == {"–"}
 
 

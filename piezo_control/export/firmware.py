@@ -122,7 +122,7 @@ def firmware(
 
 
 def write(folder: Path, files: dict[str, str]) -> list[Path]:
-    """Write the files, all or none, into `folder`, which is made if it is not there; return their paths."""
+    """Write the files, all or none, into `folder`, made if it is not there; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in files]
     with replaced(*paths) as places:

@@ -92,9 +92,10 @@ class BagWriter:
 
 
 def recover(path: Path, to: Path) -> str:
-    """Write what can be read of the bag at `path` as a whole bag; return a sentence of what was in it.
+    """Write what can be read of the bag at `path` as a whole bag; say what was in it.
 
-    Raises BagError for what is no bag at all or one of which nothing can be read, ValueError when `to` exists.
+    Raises BagError for what is no bag at all or one of which nothing can be read, ValueError
+    when `to` exists.
     """
     found = open_bag(path)
     if not any(topic.data for topic in found.topics.values()):

@@ -2,8 +2,8 @@
 """From a recording to its figures of merit; everything here is computed from bags alone.
 
 There is one analysis per kind of experiment, a function of a recording that returns ``{quantity: value}``.
-`QUANTITIES` says how each is shown and what it is; :func:`analyse` makes a value that does not exist, a settling that
-never comes, None.
+`QUANTITIES` says how each is shown and what it is; :func:`analyse` makes a value that does not
+exist, a settling that never comes, None.
 The definitions are those of :mod:`piezo_control.metrics`.
 """
 
@@ -279,13 +279,14 @@ def analyse(recording: Recording, kind: str) -> Figures:
 
 
 def classify(recording: Recording) -> str:
-    """Return the kind of experiment that the signals of a recording suggest, and as which they can be analysed.
+    """Return the kind of experiment that the signals suggest, and as which they can be analysed.
 
-    In this order: a reference that goes from value to value, which a controller follows; a tip force that
-    changes, a temperature that changes; a reference of many frequencies; a cyclic one (`hysteresis` when the
-    voltage is proportional to it); any other one that swings (`excite`); one that stays what it was before (`hold`);
-    a voltage held under a static gain (`creep` when that lasts for more than 10 s); any other reference: a step.
-    Without a reference the voltage decides.
+    In this order: a reference that goes from value to value, which a controller follows; a tip
+    force that changes, a temperature that changes; a reference of many frequencies; a cyclic one
+    (`hysteresis` when the voltage is proportional to it); any other one that swings (`excite`);
+    one that stays what it was before (`hold`); a voltage held under a static gain (`creep` when
+    that lasts for more than 10 s); any other reference: a step. Without a reference the voltage
+    decides.
 
     Raises BagError saying why it cannot be analysed as the first of these.
     """
@@ -301,7 +302,7 @@ def classify(recording: Recording) -> str:
 
 
 def _suggested(recording: Recording) -> Iterator[str]:
-    """Yield the kinds of experiment that :func:`classify` has to choose from, the likeliest first."""
+    """Yield the kinds that :func:`classify` has to choose from, the likeliest first."""
     has_reference = bool(np.all(np.isfinite(recording.reference)))
     drive = recording.reference if has_reference else recording.voltage
     if not np.all(np.isfinite(drive)):

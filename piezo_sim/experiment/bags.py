@@ -43,8 +43,9 @@ def analysed(
 
     Each as `kind`, or as what it looks like. `finger`, `run` and `partial` are of bags
     (:func:`piezo_control.recording.recording.read`), `columns` and `sample_time` of tables
-    (:func:`piezo_control.identification.table.read_columns`). A recording whose signals are not those of
-    such an experiment is left out, and the BagError that names it put into `refused`; raised, where there is none.
+    (:func:`piezo_control.identification.table.read_columns`). A recording whose signals are not
+    those of such an experiment is left out, and the BagError that names it put into `refused`;
+    raised, where there is none.
     """
 
     def recorded(path: Path) -> tuple[Recording, str]:
@@ -145,7 +146,8 @@ def analyse_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
 def compare_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
     """Return sections with all bags in one plot and one table, the first being the reference.
 
-    Below each other bag the table says how far its figures are from those of the first, step by step, or why not.
+    Below each other bag the table says how far its figures are from those of the first, step by
+    step, or why not.
     Raises BagError when the bags are of different kinds.
     """
     kinds = {name: one.kind for name, one in found.items()}
@@ -161,7 +163,7 @@ def compare_bags(found: Mapping[str, Analysed], out: Path) -> list[Section]:
         rows |= {f"{name} {of}".strip(): figures for of, figures in one.figures.items()}
         here, there = len(one.figures), len(found[first].figures)
         if here != there:
-            rows[f"  {name} − {first}: none, it has {here} steps and not {there}"] = {}
+            rows[f"  {name} − {first}: none, steps: {here} and {there}"] = {}
         elif name != first:
             pairs = zip(one.figures.items(), found[first].figures.values())
             rows |= {

@@ -148,7 +148,7 @@ def run_analyse(arguments: argparse.Namespace, out: Path, console: Console) -> i
 
 
 def run_compare(arguments: argparse.Namespace, out: Path, console: Console) -> int:
-    """Compare bags in one plot and one table; those that cannot be analysed are named and left out."""
+    """Compare bags in one plot and one table, without those that cannot be analysed."""
     from piezo_sim.experiment.bags import compare_bags
 
     found, code = _analyse(arguments, least=2)
@@ -170,9 +170,8 @@ def run_recover(arguments: argparse.Namespace, out: Path, console: Console) -> i
             whole = Path(name).with_suffix("") if path.is_file() else Path(name)
             try:
                 said.append(f"{recover(path, folder / whole)} written to {out / whole}")
-            except (
-                ValueError
-            ) as error:  # also of two files whose names differ in their suffixes alone
+            except ValueError as error:
+                # Of what is no bag, and of a second one of this name, as are x.mcap and x.db3.
                 print(f"experiment: {error}", file=sys.stderr)
                 code = FAILED
         if not said:

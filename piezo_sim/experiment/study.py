@@ -64,11 +64,12 @@ def run(arguments: argparse.Namespace, title: str, work: Work) -> int:
 
 @contextlib.contextmanager
 def results_folder(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a new folder beside `out` for results, which take their place in `out` when all went well.
+    """Yield a new folder beside `out` for results, which are moved to `out` when all went well.
 
-    Recordings and files replace what has the same name; everything else in `out` stays. After a failure the folder
-    is left as it is and named, for its logs and for the bags of a run that was cut; no later run touches it. Raises
-    FileExistsError if `out` is a file, or holds something, also what came meanwhile, and may not be replaced.
+    Recordings and files replace what has the same name; everything else in `out` stays. After a
+    failure the folder is left as it is and named, for its logs and for the bags of a run that was
+    cut; no later run touches it. Raises FileExistsError if `out` is a file, or holds something,
+    also what came meanwhile, and may not be replaced.
     """
     _need_room(out, overwrite)
     place = out.resolve()
@@ -104,7 +105,7 @@ def _is_made(folder: Path) -> bool:
 
 
 def _put(made: Path, place: Path) -> None:
-    """Move what was made to its place; a recording is replaced whole, any other folder entry by entry."""
+    """Move what was made to its place; a recording is replaced whole, other folders by entry."""
     if made.is_dir() and place.is_dir() and not (made / "metadata.yaml").exists():
         for entry in made.iterdir():
             _put(entry, place / entry.name)

@@ -31,7 +31,7 @@ DISCOVERY = 1.0  # s, in which the nodes that run become known
 
 
 def need_free(*namespaces: str, instead: str = "ROS_DOMAIN_ID") -> None:
-    """Refuse to start nodes where others run, for both would drive one finger; raise ParameterError naming them.
+    """Raise ParameterError, naming them, where others run: two would drive one finger.
 
     `instead` is what the user may name another one of.
     """
@@ -42,7 +42,8 @@ def need_free(*namespaces: str, instead: str = "ROS_DOMAIN_ID") -> None:
         names = [name for where, _, name in running if where == namespace]
         if names:
             raise ParameterError(
-                f"{namespace or '/'} has nodes already: {', '.join(names)}; end them, or name another {instead}"
+                f"{namespace or '/'} has nodes already: {', '.join(names)}; "
+                f"end them, or name another {instead}"
             )
 
 

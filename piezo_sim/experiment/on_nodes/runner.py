@@ -31,8 +31,9 @@ def run_cases(
 ) -> Iterator[CaseRun]:
     """Run `cases` one after the other on the same node processes; bags go to `out`/bags.
 
-    Raises ParameterError when others run in the namespace, NodeDied when a node process ends, RunFailed when a run does not, Interrupted on SIGINT and
-    SIGTERM. Whatever happens, no process is left behind.
+    Raises ParameterError when others run in the namespace, NodeDied when a node process ends,
+    RunFailed when a run does not, Interrupted on SIGINT and SIGTERM. Whatever happens, no process
+    is left behind.
     """
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     discovery = params_folder() / "discovery.xml"
