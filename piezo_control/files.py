@@ -29,10 +29,11 @@ def replaced(*paths: Path) -> Iterator[list[Path]]:
             place.unlink(missing_ok=True)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write plain data as JSON, which knows neither NaN nor infinity: they become null."""
+def write_json(path: Path, content: Any) -> Path:
+    """Write plain data as JSON, which knows neither NaN nor infinity: they become null. Return the path."""
     with replaced(path) as (place,):
         place.write_text(json.dumps(_finite(content), indent=2, ensure_ascii=False) + "\n")
+    return path
 
 
 def _finite(value: Any) -> Any:

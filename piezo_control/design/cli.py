@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import math
 import os
 import sys
 import time
@@ -36,6 +34,7 @@ from piezo_control.design.certificate import Certificate, Row, certify  # noqa: 
 from piezo_control.design.problem import DesignProblem, SynthesisError  # noqa: E402
 from piezo_control.design.synthesis import synthesize  # noqa: E402
 from piezo_control.feedback import FeedbackParameters  # noqa: E402
+from piezo_control.files import write_json  # noqa: E402
 from piezo_control.hysteresis import (  # noqa: E402
     HysteresisParameters,
     coefficients,
@@ -203,11 +202,8 @@ def write_report(
 ) -> list[Path]:
     """Write certificate, complete problem and pictures; return their paths. `origin` is the finger's."""
     folder.mkdir(parents=True, exist_ok=True)
-    as_json = folder / "certificate.json"
-    as_json.write_text(
-        json.dumps(_finite({**certificate.as_dict(), "origin": origin.splitlines()}), indent=2)
-        + "\n"
-    )
+    content = {**certificate.as_dict(), "origin": origin.splitlines()}
+    as_json = write_json(folder / "certificate.json", content)
     solved = folder / "problem.yaml"
     dump(
         solved,
@@ -216,15 +212,6 @@ def write_report(
         f"Design problem of '{problem.name}', nothing left open.",
     )
     return [as_json, solved, *design_plots.draw(problem, controller, certificate, folder)]
-
-
-def _finite(value: Any) -> Any:
-    """Return plain data without NaN and infinities, which JSON does not know: they become null."""
-    if isinstance(value, dict):
-        return {name: _finite(entry) for name, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 HEADINGS = ("specification", "required", "nominal", "worst case", "met", "worst at")

@@ -14,6 +14,7 @@ from piezo_control.design.certificate import Box, Certificate, transfer_response
 from piezo_control.design.linear_loop import closed_loop, controller_response, respond
 from piezo_control.design.problem import DesignProblem
 from piezo_control.feedback import FeedbackParameters
+from piezo_control.files import replaced
 
 BOX = {"color": "tab:blue", "lw": 0.5, "alpha": 0.35}
 NOMINAL = {"color": "k", "lw": 1.4}
@@ -39,7 +40,8 @@ def draw(
         for axis in figure.axes:
             axis.grid(alpha=0.3)
         paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=110)
+        with replaced(paths[-1]) as (place,):
+            figure.savefig(place, dpi=110)
     return paths
 
 

@@ -12,7 +12,6 @@ feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.y
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -28,6 +27,7 @@ from piezo_control.creep import CreepParameters
 from piezo_control.dynamics import DynamicsParameters, ModesParameters
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
+from piezo_control.files import write_json
 from piezo_control.hysteresis import HysteresisParameters, deflection_history
 from piezo_control.identification import checks, plots
 from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
@@ -547,12 +547,6 @@ def figures(fit: FitQuality) -> dict[str, float]:
         "rms_percent": fit.rms_percent,
         "maximum_percent": fit.maximum_percent,
     }
-
-
-def write_json(path: Path, content: dict) -> Path:
-    """Write `content` and return the path."""
-    path.write_text(json.dumps(content, indent=2) + "\n")
-    return path
 
 
 def parse(words: Sequence[str] | None) -> argparse.Namespace:

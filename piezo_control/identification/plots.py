@@ -14,6 +14,7 @@ import numpy as np  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
+from piezo_control.files import replaced  # noqa: E402
 from piezo_control.identification.hysteresis import HysteresisModel  # noqa: E402
 from piezo_control.identification.measurement import Measurement  # noqa: E402
 
@@ -82,5 +83,6 @@ def responses(curves: list[tuple[str, NDArray]], found: list[str], path: Path) -
 def _finish(figure: plt.Figure, path: Path) -> None:
     for axis in figure.axes:
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    with replaced(path) as (place,):
+        figure.savefig(place, dpi=110)
     plt.close(figure)
