@@ -391,6 +391,38 @@ def test_what_a_check_cannot_use_is_named(identify, tmp_path, capsys, sensor, sk
     assert message in capsys.readouterr().err
 
 
+def test_what_drift_is_not_told_is_said_and_not_written(identify, tmp_path, capsys):
+    """A laboratory at 25 °C, and a warm-up at 0 V: the slope of the creep is assumed, then kept when it is known."""
+    creep = CreepParameters(gain=5e-9, gain_per_degc=2e-10)
+    plant = CantileverParameters(sample_time=2e-2, creep=creep)
+    warming = TemperatureParameters(profile="step", base_degc=25.0, amplitude_degc=6.0, start=2.0)
+    at_25 = TemperatureParameters(profile="constant", base_degc=25.0)
+    bags = []
+    for temperatures, voltage, samples in (
+        (at_25, Profile([0.0, 1.0], [0.0, 40.0]), 15_000),
+        (warming, ZERO, 1000),
+    ):
+        bags.append(tmp_path / f"bag_{samples}")
+        result = drive(plant, temperatures, voltage, samples)
+        write_recording(bags[-1], "finger", result, voltage, ZERO)
+    path = tmp_path / "identified" / "cantilever.yaml"
+    assert identify("drift", *bags) == 0
+    said = capsys.readouterr().out
+    assert "at 25 °C; how it depends on the temperature these recordings do not tell" in said
+    assert "gain_per_degc and lag_per_degc are not told from 0: not written" in said
+    found = load(path, "cantilever")
+    assert found["thermal.sensitivity"] == pytest.approx(plant.thermal.sensitivity, rel=0.01)
+    assert "thermal.gain_per_degc" not in found and "thermal.lag_per_degc" not in found
+    assert found["creep.gain"] == pytest.approx(5.6e-9, rel=0.05)  # 5e-9 + 3 °C 2e-10
+    assert found["creep.gain_per_degc"] == 0.0
+    assert "at 25 °C; how it depends" in path.read_text()
+    path.write_text("/**/cantilever: {ros__parameters: {creep: {gain_per_degc: 2e-10}}}\n")
+    assert identify("drift", *bags) == 0
+    known = load(path, "cantilever")
+    assert known["creep.gain_per_degc"] == 2e-10
+    assert known["creep.gain"] == pytest.approx(found["creep.gain"] - 6e-10, rel=1e-9)
+
+
 def test_only_the_asked_part_of_a_recording_is_used(identify, tmp_path):
     """From 5 to 25 s of the p885 recording: 4000 rows."""
     assert identify("hysteresis", P885, *P885_COLUMNS, "--start", 5, "--end", 25) == 0

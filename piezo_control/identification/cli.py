@@ -364,24 +364,48 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     found = {name: getattr(model, name) for name in model.confidence}
     for line in lines(found, model.confidence):
         console.print(line, soft_wrap=True)
+    told = {name for name, half in model.confidence.items() if np.all(np.abs(found[name]) > half)}
     names = ", ".join(map(str, arguments.recording))
-    groups = {}
-    if model.creep_gain + model.creep_gain_per_degc > 0.0:
+    notes: list[str] = []
+    groups: dict[str, dict[str, Any]] = {}
+    if "creep_gain" in told:
+        gain, per_degc = model.creep_gain, model.creep_gain_per_degc
+        if "creep_gain_per_degc" not in told:
+            warmth = model.creep_degc - REFERENCE_DEGC
+            seen, per_degc = gain + per_degc * warmth, stored_creep(arguments.out).gain_per_degc
+            gain = max(0.0, seen - per_degc * warmth)
+            notes.append(
+                f"creep_gain was {seen:.4g} m/V at {model.creep_degc:.3g} °C; how it depends on the temperature these "
+                f"recordings do not tell: taken as {per_degc:.4g} m/V per °C, "
+                + ("which was known" if per_degc else "the same at 22 °C and at all others")
+            )
         groups["creep"] = {
-            "gain": model.creep_gain,
-            "gain_per_degc": model.creep_gain_per_degc,
+            "gain": gain,
+            "gain_per_degc": per_degc,
             "times": model.creep_times,
             "shares": model.creep_shares,
         }
-    heat = ["gain_per_degc", "lag_per_degc"]
-    if model.time_constant > 0.0:  # a recording warms up
-        heat += ["sensitivity", "time_constant"]
-    if any(getattr(model, name) for name in heat):
-        groups["thermal"] = {name: getattr(model, name) for name in heat}
-    comment = said("drift", f"identified from {names}", found, model.confidence)
+    thermal: dict[str, float] = {}
+    # What is not told of a pair is 0 in it: the other was found beside that.
+    for pair, is_told in (
+        (("gain_per_degc", "lag_per_degc"), {"gain_per_degc", "lag_per_degc"} & told),
+        (("sensitivity", "time_constant"), {"sensitivity"} & told),
+    ):
+        if is_told:
+            thermal |= {name: getattr(model, name) * (name in told) for name in pair}
+        else:
+            notes.append(f"{' and '.join(pair)} are not told from 0: not written")
+    if thermal:
+        groups["thermal"] = thermal
+    if "creep" not in groups:
+        notes.append("creep is not told from 0: not written")
+    for note in notes:
+        console.print(note, soft_wrap=True)
+    source = "; ".join((f"identified from {names}", *notes))
+    comment = said("drift", source, found, model.confidence)
     written = store(arguments.out, "drift", comment, groups) if groups else []
     loop = next(filter(is_cold_loop, measurements), None)
-    if loop and stored.exists():
+    if loop and stored.exists() and "creep" in groups:
         lag = stored_sensor(arguments.out).lag
         dead_zones = len(operator.upper_thresholds)
         fresh = identify_hysteresis(model.cleared(loop), operator.thresholds, dead_zones, lag)
@@ -449,6 +473,14 @@ def stored_hysteresis(path: Path) -> HysteresisParameters:
     values = load(path, "feedforward")
     operator = {n: value for n, value in values.items() if n.startswith("hysteresis.")}
     return build(FeedforwardParameters, operator, str(path)).hysteresis
+
+
+def stored_creep(folder: Path) -> CreepParameters:
+    """Return how creep depends on the temperature by cantilever.yaml, not at all where it says nothing."""
+    path = folder / "cantilever.yaml"
+    values = load(path, "cantilever") if path.exists() else {}
+    per_degc = values.get("creep.gain_per_degc", 0.0)
+    return build(CreepParameters, {"gain_per_degc": per_degc}, str(path))
 
 
 def stored_sensor(folder: Path) -> SensorParameters:

@@ -9,9 +9,10 @@ and theta_0 the one at the start::
     times_i c_i' = share_i (gain + gain_per_degc (theta - 22)) U - c_i
 
 W being the slope of the line that hysteresis lags behind. The lag of the body and how much of the creep is
-there at 22 degC are searched; the rest is linear least squares with creep of the voltage's sign only.
+there at the lowest temperature under a voltage are searched; the rest is linear least squares with creep of the voltage's sign only.
 Relaxation times are on a grid, so that creep of any course is met, logarithmic too. Every recording has its
-own offset. How the width of the loop changes, m, is told by the same loop recorded at two temperatures.
+own offset. How the width of the loop changes, m, is told by the same loop recorded at two temperatures, how
+creep and stroke do by voltages at two temperatures; from one alone, all creep counts as that at 22 degC.
 """
 
 from __future__ import annotations
@@ -38,11 +39,12 @@ ROWS = 3000  # per recording, of block means: vibration and noise average out
 RELAXATIONS = 8  # from block to recording, two or so per decade
 JUMP = 0.1  # of the static range, from block to block: such blocks ring and are not fitted
 SMALLEST_WARMING = 1.0  # degC, to tell what depends on temperature
+LEVELS = 10  # parts of a recording whose mean temperatures count: a thermocouple's noise does not
 
 
 @dataclass(frozen=True)
 class DriftModel:
-    """Creep and thermal deflection, named as the cantilever's parameters."""
+    """Creep and thermal deflection, named as the cantilever's parameters; 0 with an interval of 0: not told."""
 
     creep_gain: float  # m/V
     creep_gain_per_degc: float  # m/(V degC)
@@ -52,6 +54,7 @@ class DriftModel:
     time_constant: float  # s
     gain_per_degc: float  # 1/degC, of the hysteresis
     lag_per_degc: float  # 1/degC, of its width
+    creep_degc: float  # at which the creep was seen, on average; NaN: none
     fitted: tuple[NDArray[np.float64], ...]  # per recording: time (s), measured and modelled (m)
     without: tuple[
         NDArray[np.float64], ...
@@ -114,6 +117,9 @@ class _Means:
         self.static = means(deflection_history(hysteresis, measurement.voltage))
         self.lag = sum(hysteresis.weights) * self.voltage - self.static
         self.temperature = means(measurement.temperature)
+        levels = [np.mean(part) for part in np.array_split(self.temperature, LEVELS)]
+        self.coldest, self.warmest = float(min(levels)), float(max(levels))
+        self.creeps = bool(np.ptp(self.voltage) > 0.0)
         jumps = np.abs(np.diff(self.static, prepend=self.static[0])) > JUMP * np.ptp(self.static)
         self.kept = ~(jumps | np.roll(jumps, 1))
         first = settled(measurement) if is_loop(measurement.voltage) else 0
@@ -143,7 +149,7 @@ def identify_drift(
     Parameters
     ----------
     measurements : recordings of one finger; a voltage step for the creep, a change of temperature for
-        the thermal part, both temperatures for the creep's dependence on it
+        the thermal part, voltages at two temperatures for the dependence of creep and stroke on it
     hysteresis : the finger's operator
 
     Raises
@@ -157,15 +163,16 @@ def identify_drift(
         if np.ptp(measurement.voltage) > 0.0:
             direction(measurement)
     source = ", ".join(m.source for m in measurements)
-    creeping = any(np.ptp(r.voltage) > 0.0 for r in recordings)
-    warming = any(np.ptp(r.temperature) >= SMALLEST_WARMING for r in recordings)
+    creeping = [r for r in recordings if r.creeps]
+    warming = any(r.warmest - r.coldest >= SMALLEST_WARMING for r in recordings)
     if not (creeping or warming):
         raise MeasurementError(
             f"{source}: voltage and temperature are constant: nothing to identify"
         )
-    warmest = max(float(r.temperature.max()) for r in recordings) - REFERENCE_DEGC
-    coldest = min(float(r.temperature.min()) for r in recordings) - REFERENCE_DEGC
-    spans_temperatures = warmest - coldest >= SMALLEST_WARMING and warmest > 0.0
+    # Without a voltage there is neither creep nor stroke to depend on the temperature.
+    coldest = min((r.coldest for r in creeping), default=REFERENCE_DEGC)
+    warmest = max((r.warmest for r in creeping), default=REFERENCE_DEGC)
+    spans_temperatures = warmest - coldest >= SMALLEST_WARMING
     longest = max(float(r.time[-1]) for r in recordings)
     slowest = max(r.step for r in recordings)
     times = np.geomspace(slowest, 0.5 * longest, RELAXATIONS)
@@ -195,11 +202,12 @@ def identify_drift(
             warmth = body - REFERENCE_DEGC
             strength = np.ones_like(warmth)
             if spans_temperatures:
-                strength = np.maximum(cold_share + (1.0 - cold_share) * warmth / warmest, 0.0)
+                rise = (body - coldest) / (warmest - coldest)
+                strength = np.maximum(cold_share + (1.0 - cold_share) * rise, 0.0)
             columns = [r.relax(r.voltage * strength, t, 0.0) for t in times]
-            columns.append(body - body[0])
-            columns.append(warmth * r.static)
-            columns.append(-warmth * r.lag if twins else np.zeros_like(warmth))
+            columns.append((body - body[0]) * warming)
+            columns.append(warmth * r.static * spans_temperatures)
+            columns.append(-warmth * r.lag * bool(twins))
             columns.append(r.static)
             offsets = np.zeros((len(body), len(recordings)))
             offsets[:, number] = number not in dict(twins)  # a difference has one offset
@@ -216,32 +224,37 @@ def identify_drift(
         x = lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x / norms
         return x, measured - matrix @ x
 
-    low = np.array([np.log(0.1 * slowest), 0.0])
+    # No creep is less than none at 22 degC.
+    least = max(0.0, coldest - REFERENCE_DEGC) / max(warmest - REFERENCE_DEGC, SMALLEST_WARMING)
+    least *= spans_temperatures
+    low = np.array([np.log(0.1 * slowest), least])
     high = np.array([np.log(3.0 * longest), 1.0])
     found = least_squares(
         lambda p: linear(np.exp(p[0]), p[1])[1] / scale,
-        (np.log(1e-3 * longest + 2.0 * slowest), 0.3),
+        (np.log(1e-3 * longest + 2.0 * slowest), least + 0.3 * (1.0 - least)),
         bounds=(low, high),
     )
-    if not spans_temperatures:
-        warmest = 1.0
 
     def values(numbers: NDArray) -> dict[str, Any]:
         (log, cold_share), amounts = numbers[:2], numbers[2 : 2 + RELAXATIONS]
         shift, growth, widening, static = numbers[2 + RELAXATIONS : 6 + RELAXATIONS].tolist()
         total = float(np.sum(amounts))
-        cold_share = float(cold_share) if spans_temperatures else 1.0
+        per_degc = (
+            total * (1.0 - float(cold_share)) / (warmest - coldest) if spans_temperatures else 0.0
+        )
         shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
-        gain_per_degc = growth / static if (warming and creeping) or twins else 0.0
+        gain_per_degc = growth / static if (warming and spans_temperatures) or twins else 0.0
         return {
-            "creep_gain": total * cold_share,
-            "creep_gain_per_degc": total * (1.0 - cold_share) / warmest,
+            "creep_gain": total - per_degc * (warmest - REFERENCE_DEGC),
+            "creep_gain_per_degc": per_degc,
             "creep_shares": tuple(shares[there].tolist()),
             "sensitivity": shift if warming else 0.0,
             "time_constant": float(np.exp(log)) if warming else 0.0,
             "gain_per_degc": gain_per_degc,
             # The lag grows with the stroke, too, at the temperature at which it was seen.
-            "lag_per_degc": widening / static / (1.0 + gain_per_degc * warmest) if twins else 0.0,
+            "lag_per_degc": widening / static / (1.0 + gain_per_degc * (warmest - REFERENCE_DEGC))
+            if twins
+            else 0.0,
         }
 
     def modelled(searched: NDArray) -> list[NDArray]:
@@ -265,6 +278,9 @@ def identify_drift(
     return DriftModel(
         **values(numbers),
         creep_times=tuple(times[there].tolist()),
+        creep_degc=float(np.mean([np.mean(r.temperature) for r in creeping]))
+        if creeping
+        else np.nan,
         fitted=tuple(
             np.column_stack((r.time[r.kept], deflection, m + np.mean(deflection) - np.mean(m)))
             for r, deflection, m in zip(recordings, deflections, curves)
