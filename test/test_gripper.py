@@ -20,6 +20,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from rclpy.experimental.events_executor import EventsExecutor
+from std_srvs.srv import Trigger
 
 from piezo_control.gripper import (
     REST_TIME,
@@ -30,10 +31,10 @@ from piezo_control.gripper import (
     force_of,
     opening_of,
 )
-from piezo_control.nodes.qos import LATCHED
+from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.parameters import ParameterError, build
 from piezo_gripper_msgs.action import Grip
-from piezo_gripper_msgs.msg import FingerState
+from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
@@ -357,6 +358,28 @@ def test_new_goal_takes_over_and_the_old_one_is_aborted(bench):
     answer = bench.result_of(new.get_result_async())
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert "a new goal takes over" in bench.log.read_text()
+
+
+@pytest.mark.parametrize("asks", ["grip", "stop"])
+def test_motion_and_stop_begin_where_somebody_else_has_left_the_reference(bench, asks):
+    place = -3e-6  # m, of the left finger alone; the gripper left it at 0
+    set_points = bench.node.create_publisher(Sample, "left/reference", SETPOINT)
+    bench.wait(lambda: set_points.get_subscription_count() > 0)
+    set_points.publish(Sample(value=place))
+    bench.wait(lambda: bench.states["left"].reference == place)
+    bench.wait(lambda: abs(bench.states["left"].deflection - place) < 0.2e-6)
+    # The gripper has heard a state as new as that.
+    number = bench.states["left"].samples
+    bench.wait(lambda: bench.states["left"].samples > number + 1000)
+    if asks == "grip":
+        bench.moving(bench.send(36e-6, 0.0, SLOW))
+    else:
+        stop = bench.node.create_client(Trigger, "gripper/stop")
+        bench.wait(stop.service_is_ready)
+        bench.result_of(stop.call_async(Trigger.Request()))
+        bench.wait(lambda: bench.references["left"])
+    # Stopped, it is held no further ahead of its tip than it was.
+    assert bench.references["left"][0].value[0] == pytest.approx(place, abs=0.2e-6)
 
 
 @pytest.mark.shows("a gripper that is gone")
