@@ -32,7 +32,7 @@ from rclpy.subscription import Subscription
 from piezo_control.design.preview import asked
 from piezo_control.feedback import Feedback, FeedbackParameters, controller_file, successor
 from piezo_control.nodes import base
-from piezo_control.nodes.block import BlockNode
+from piezo_control.nodes.block import BlockNode, command_range
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
@@ -214,7 +214,7 @@ class FeedbackNode(BlockNode):
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()
         p = self.parameters
-        figures |= {"controller": p.name, "certified": p.certified}
+        figures |= {"controller": p.name, "certified": p.certified, **command_range(p)}
         if p.force_control:
             figures |= {"controller": "force control", "certified": False, "push": self.touch.push}
         return wrong, figures

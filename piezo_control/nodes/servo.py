@@ -4,7 +4,8 @@
 in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0),
      reference_waveform (Waveform, m), temperature (sensor_msgs/Temperature, °C) with `force_control`
 out: samples (SampleBlock: every sample), deflection (Sample, m), command (Sample, m), voltage (Sample, V): one
-     in a hundred or so, state (FingerState), push (Sample, N) with `force_control`: the force of an object
+     in a hundred or so, state (FingerState), reference_followed_profile (Profile, m), reference_followed_waveform
+     (Waveform, m), push (Sample, N) with `force_control`: the force of an object
 
 One compiled loop in a thread under the real-time scheduler, at the sample time of its controller; ROS
 runs beside it and can be late without the finger noticing. What the certificate of the controller does not
@@ -22,10 +23,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from std_msgs.msg import Header
 
 from piezo_control.feedback import FeedbackParameters, controller_file, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.block import command_range
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
@@ -71,7 +74,9 @@ class ServoNode(FingerNode):
         self.states = self.create_publisher(FingerState, "state", LATCHED)
         self.thermometer = Thermometer(self.parameters.thermometer, time.monotonic())
         self._temperature_input: TemperatureInput | None = None
-        self.reference = ProfileInput(self, "reference", 1.0, LARGEST_DEFLECTION, self._refer)
+        self.reference = ProfileInput(
+            self, "reference", 1.0, LARGEST_DEFLECTION, self._refer, says=True
+        )
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
         )
@@ -210,6 +215,7 @@ class ServoNode(FingerNode):
         figures: dict[str, Any] = {
             "controller": s.feedback.name,
             "certified": s.feedback.certified,
+            **command_range(s.feedback),
             "not covered": "; ".join(self._objections),
             "sample": s.number,
             "rate (Hz)": f"{self._rate():.1f}",
@@ -231,6 +237,7 @@ class ServoNode(FingerNode):
     def _refer(self) -> None:
         if self.servo:
             self.servo.refer(self.reference.signal, self.reference.max_force)
+            self.reference.say(Header(stamp=base.system_time()))
 
     def _on_temperature(self, degc: float, _: float) -> None:
         self.thermometer.hear(degc, time.monotonic())
@@ -346,10 +353,10 @@ class ServoNode(FingerNode):
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
             state.text = s.cause or self._doubts(s)
+            state.reference = self.reference[state.samples]
             state.since = base.wall_time(self._since)
             state.times = s.faults
             if self._last:
-                state.reference = float(self._last.reference[-1])
                 state.deflection = float(self._last.deflection[-1])
             worst = max((error for _, error in self._errors), default=np.inf)
             state.on_target = bool(
