@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from std_msgs.msg import Header
 
-from piezo_control.feedback import FeedbackParameters, controller_file, successor
+from piezo_control.feedback import FeedbackParameters, controller_file, is_limited, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.block import command_range
@@ -83,6 +83,7 @@ class ServoNode(FingerNode):
         self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.phase = FingerState.IDLE
         self._last: Samples | None = None
+        self._held = 0  # samples whose command was at an end of its range
         self._told = 0.0
         self._errors: list[tuple[float, float]] = []
 
@@ -155,6 +156,7 @@ class ServoNode(FingerNode):
         self.reference.restart(controller.sample_time)
         self._refer()
         self._told = time.monotonic()
+        self._held = 0
         self._since = math.nan
         self._rates = [(self._told, 0)]
         self._errors.clear()
@@ -221,7 +223,7 @@ class ServoNode(FingerNode):
             "rate (Hz)": f"{self._rate():.1f}",
             "missed periods": s.missed,
             "samples not published": s.lost,
-            "clipped": s.clipped,
+            "clipped": s.clipped + self._held,
             "faults": s.faults,
         }
         for share in (0.5, 0.9, 0.99, 0.999):
@@ -288,6 +290,9 @@ class ServoNode(FingerNode):
         for part in np.split(np.arange(len(samples)), ends):
             self.blocks.publish(self._block(samples, part))
         error = np.abs(samples.reference - samples.deflection)
+        by_controller = s.feedback.controller != "none" or self.parameters.force_control
+        held = is_limited(s.feedback, samples.command, samples.reference, by_controller)
+        self._held += int(np.count_nonzero(held))
         self._errors.append(
             (samples.instant[-1], float(np.max(error, where=error >= 0, initial=0)))
         )
@@ -348,7 +353,7 @@ class ServoNode(FingerNode):
             state.samples = max(0, s.number + 1)
             state.period = s.sample_time
             state.voltage = s.voltage
-            state.clipped = s.clipped
+            state.clipped = s.clipped + self._held
             state.overruns = s.missed
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
