@@ -270,11 +270,16 @@ def test_fingerctl_moves_and_shows(control, finger):
     assert control("wave", *wave) == (0, "")
 
 
-def test_fingerctl_lifecycle_and_parameters(control):
+def test_fingerctl_lifecycle_and_parameters(ros, control):
     assert control("lifecycle", "temperature") == (0, "/finger/temperature: active\n")
     assert "/finger/recorder: unconfigured\n" in control("lifecycle")[1]
     code, text = control("params", "cantilever")
     assert yaml.safe_load(text)["sample_time"] == SAMPLE_TIME
+    narrow = io.StringIO()  # as a pipe is; lines stay whole
+    fingerctl.carry_out(
+        ros, fingerctl.parse(["params", "cantilever"]), Console(file=narrow, width=20)
+    )
+    assert narrow.getvalue() == text
     assert control("params", "cantilever", "hold_time", "1") == (0, "")
     assert control("params", "cantilever", "hold_time") == (0, "{hold_time: 1.0}\n")
 
@@ -297,6 +302,25 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
             "refuses: Parameter hold_time out of range",
         ),
         (["params", "cantilever", "hold"], 1, "has no parameter 'hold'"),
+        (
+            ["params", "cantilever", "hold_time", "[1"],
+            2,
+            "'hold_time' is '[1', must be YAML: while",
+        ),
+        (
+            ["params", "cantilever", "hold_time", "{a: 1}"],
+            2,
+            "'hold_time' is {'a': 1}, must be a number",
+        ),
+        (
+            ["params", "/bad name", "hold_time"],
+            2,
+            "'/bad name' cannot be: namespace must not contain",
+        ),
+        (["-f", "bad name!", "state"], 2, "'bad name!' cannot be: namespace must not contain"),
+        (["grip", "30", "--gripper", "1x"], 2, "'1x' cannot be: namespace must not have a token"),
+        # The sensor's quantum is 10 nm.
+        (["set", "0.005", "--wait", "--near-um", "0.001"], 1, "µm, not at 0.005 µm: running"),
         (["control", "robst"], 1, "not one of the known"),
         (["wave", "sweep", "--amplitude-um", "1", "--frequency-hz", "1"], 2, "end_frequency is 0"),
         (["set", "1e6"], 1, "deflection is 1 m, must be within"),
@@ -307,7 +331,8 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
         ),
     ],
 )
-def test_fingerctl_says_what_is_refused(control, capsys, words, code, message):
+def test_fingerctl_says_what_is_refused(ros, control, capsys, monkeypatch, words, code, message):
+    monkeypatch.setattr(ros, "timeout", 10.0)
     assert control(*words)[0] == code
     assert message in capsys.readouterr().err
 

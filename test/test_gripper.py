@@ -27,9 +27,12 @@ from piezo_control.gripper import (
     Goal,
     GripperParameters,
     Motion,
+    Waypoint,
     check_goal,
+    check_trajectory,
     force_of,
     opening_of,
+    reach,
 )
 from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.parameters import ParameterError, build
@@ -149,6 +152,17 @@ def test_goal_takes_defaults_for_zero():
 def test_goal_out_of_range_is_named(goal, message):
     with pytest.raises(ValueError, match=message):
         check_goal(DEFAULTS, *goal)
+
+
+@pytest.mark.parametrize("off", [-0.9e-9, -1e-20, 1e-20, 0.9e-9])
+def test_an_end_of_the_reach_that_was_rounded_is_that_end(off):
+    for end in reach(DEFAULTS):
+        opening = min(max(end + off, 0.0), 80e-6)
+        assert check_goal(DEFAULTS, end + off, 0.0, 0.0).opening in (opening, end)
+        way = check_trajectory(DEFAULTS, [Waypoint(1.0, end + off)], 40e-6)
+        assert way.opening in (opening, end)
+    with pytest.raises(ValueError, match="must be in"):
+        check_goal(DEFAULTS, -1.1e-9, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(

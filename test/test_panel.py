@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a panel: what it keeps and draws, and all of it in a real browser in front of a running gripper."""
 
+import asyncio
 import http.client
 import math
 import os
@@ -18,6 +19,7 @@ import pytest
 from ament_index_python.packages import get_package_prefix
 from bokeh.events import ButtonClick
 
+from piezo_control.nodes import panel as panel_node
 from piezo_control.nodes.client import ClientError, connect
 from piezo_control.nodes.qos import SAMPLE
 from piezo_control.panel.cards import Card, Gauge, Message, render
@@ -225,6 +227,23 @@ def test_field_and_slider_follow_the_reference_unless_somebody_is_at_them(record
     um = math.nan  # nobody has told one
     recorded.controls.follow()
     assert (field.value_input, slider.value) == ("4", 7.0)
+
+
+def test_what_a_panel_does_again_and_again_goes_on_after_something_went_wrong(caplog, monkeypatch):
+    monkeypatch.setattr(panel_node, "REVIEW_PERIOD", 0.0)
+    done = []
+
+    async def act():
+        done.append(len(done))
+        if len(done) == 1:
+            raise RuntimeError("once")
+        if len(done) == 3:
+            raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(panel_node.repeat(act))
+    assert done == [0, 1, 2]
+    assert "RuntimeError: once" in caplog.text
 
 
 # --- in a browser -------------------------------------------------------------------------------------
@@ -562,6 +581,7 @@ def test_command_line():
     for words, code, said in (
         (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: [Errno 99] Cannot assign"),
         (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
+        (["-f", "bad name"], 2, "panel: error: 'bad name' cannot be: namespace must not contain"),
     ):
         done = subprocess.run(
             [EXECUTABLES / "panel", *words], capture_output=True, text=True, timeout=TIMEOUT

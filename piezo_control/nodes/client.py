@@ -36,6 +36,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.action import ActionClient
 from rclpy.context import Context
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -43,6 +44,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from rclpy.validate_namespace import validate_namespace
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
@@ -139,6 +141,17 @@ class Setup(NamedTuple):
     """N; NaN for a finger that feels none."""
 
 
+def full_namespace(text: str) -> str:
+    """Return the full namespace that is meant by a text; ValueError where it cannot be one."""
+    full = "/" + text.strip("/")
+    try:
+        validate_namespace(full)
+    except InvalidNamespaceException as error:
+        why = str(error).splitlines()[0].rpartition("namespace: ")[2].rstrip(":")
+        raise ValueError(f"'{text}' cannot be: {why}") from None
+    return full
+
+
 def same(one: Signal, other: Signal) -> bool:
     """Say whether two signals are the same function of time."""
     return type(one) is type(other) and all(
@@ -211,7 +224,7 @@ class Ros:
     def finger(self, namespace: str = "") -> Finger:
         """Return the finger in a namespace, or, when none is named, the only one that is there."""
         if namespace:
-            return Finger(self, "/" + namespace.strip("/"))
+            return Finger(self, full_namespace(namespace))
         self.wait(lambda: bool(self.fingers()), lambda: "no finger is running in this ROS domain")
         found = self.fingers()
         if len(found) > 1:
@@ -287,7 +300,14 @@ class Ros:
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
         client = self._parameter_client(node)
-        changes = [Parameter(name, value=value) for name, value in values.items()]
+        changes = []
+        for name, value in values.items():
+            try:
+                changes.append(Parameter(name, value=value))
+            except TypeError:
+                raise ValueError(
+                    f"'{name}' is {value}, must be a number, true or false, a text or a list of one of them"
+                ) from None
         result = self.result(client.set_parameters_atomically(changes), node).result
         if not result.successful:
             raise ClientError(f"'{node}' refuses: {result.reason}")
@@ -298,7 +318,7 @@ class Ros:
 
     def gripper(self, namespace: str = "") -> Gripper:
         """Return the gripper in a namespace."""
-        return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
+        return Gripper(self, f"{full_namespace(namespace).rstrip('/')}/gripper")
 
     def ask(self, who: str, ask: Callable[..., Future], *words: Any, timeout: float = 0.0) -> Any:
         """Return what an action answers.
