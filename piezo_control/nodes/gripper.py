@@ -278,7 +278,7 @@ class Finger:
                 self._under_way = None  # from here on the state knows better
         if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
             self.follow(hold(0.0))
-            self.reference = None
+            self.reference = self._node.goal = None
         self._on_state(self)
 
 
@@ -291,6 +291,7 @@ class GripperNode(FingerNode):
         self.fingers: list[Finger] = []
         self.motion: Motion | None = None
         self.asker: Asker | None = None  # whose motion it is
+        self.goal: Goal | None = None  # the newest, until the fingers are somewhere else
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
         self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
         self._serve_control_action()
@@ -379,10 +380,11 @@ class GripperNode(FingerNode):
             # Opening keeps the force that is held: the references are ahead of the tips, and more would push on.
             if self.motion.closing or not finger.max_force:
                 finger.max_force = goal.max_force
-        self.asker = asker
+        self.asker, self.goal = asker, goal
 
     def halt(self, reason: str) -> None:
         """Hold the fingers where they are; a motion ends because of `reason`."""
+        self.goal = None
         self._halt_motion(failure(reason))
 
     def zero(self) -> str:
