@@ -126,7 +126,11 @@ def test_waveform_is_followed_sample_by_sample_and_recorded(finger, tmp_path):
     finger.wait_for(lambda: finger.newest().deflection > 6.5e-6)
     seen = finger.newest().time
     finger.wait_for(lambda: finger.newest().time > seen + 0.2)
+    with pytest.raises(ClientError, match="is recording already; `fingerctl record off` ends that"):
+        finger.record()
     finger.end_record()
+    with pytest.raises(ClientError, match="'/finger/recorder' is not recording$"):
+        finger.end_record()
     finger.zero()
     (message,) = open_bag(tmp_path / "bag").messages("/finger/reference_waveform", WAVEFORM_TYPE)
     followed = Waveform.of(message)
@@ -167,7 +171,7 @@ def test_the_reference_is_the_one_that_is_followed_also_for_who_joins_later(ros,
     profiles.publish(Profile(time=[0.0], value=[4e-6]))
     finger.wait_for(near(finger, 4e-6))
     finger.set(6e-6)
-    assert finger.newest().reference == 6e-6
+    finger.wait_for(lambda: finger.newest().reference == 6e-6)
     with connect(TIMEOUT) as later:
         late = later.finger("finger")
         late.wait_for(lambda: late.state is not None)
@@ -178,10 +182,14 @@ def test_the_reference_is_the_one_that_is_followed_also_for_who_joins_later(ros,
             one.wait_for(lambda one=one: one.newest().reference not in (4e-6, 6e-6))
     with connect(TIMEOUT) as later:
         late = later.finger("finger")
-        for _ in range(20):  # looks between two states see it move, too
-            late.wait_for(lambda: late.state is not None and late.newest().time > 0.0)
+
+        def is_smooth():
             reading = late.newest()
-            assert reading.reference == pytest.approx(float(wave.at(reading.time)), abs=1e-12)
+            return abs(reading.reference - wave.at(reading.time)) < 1e-12
+
+        late.wait_for(is_smooth)
+        for _ in range(20):  # looks between two states see it move, too
+            assert is_smooth()
     ros.node.destroy_publisher(profiles)
     ros.node.destroy_publisher(waveforms)
     finger.zero()

@@ -747,7 +747,7 @@ def test_the_client_moves_a_servo_and_hears_what_it_follows(tmp_path):
             seen = [finger.newest().reference for _ in range(20)]
             assert all(5e-6 <= reference <= 15e-6 for reference in seen)
             finger.set(5e-6)
-            assert finger.newest().reference == 5e-6
+            finger.wait_for(lambda: finger.newest().reference == 5e-6)
             low, high = finger.reach()
             assert (low, high) == (ROBUST.command_low, ROBUST.command_high)
             with pytest.raises(ClientError, match=f"of {low * 1e6:g} to {high * 1e6:g} µm"):

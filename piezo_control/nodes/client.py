@@ -50,6 +50,7 @@ from std_srvs.srv import Trigger
 
 from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.gripper import GripperParameters, check_goal, reach
+from piezo_control.nodes.block import seconds
 from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import from_message, waveform_message
@@ -118,6 +119,16 @@ class Reading(NamedTuple):
     """°C"""
     tip_force: float
     """N"""
+
+
+class Followed(NamedTuple):
+    """What the loop has said that it follows."""
+
+    heard: float
+    """s, of the monotonic clock"""
+    stamp: float
+    """s, of the first sample at which it does"""
+    signal: Signal
 
 
 class Setup(NamedTuple):
@@ -485,8 +496,7 @@ class Finger:
         self._heard = -math.inf
         node, watcher = ros.node, ros.watcher
         node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
-        # What the loop has said that it follows, and when that was heard (s); as many as are latched.
-        self._followed = deque[tuple[float, Signal]](maxlen=2 * FOLLOWED.depth)
+        self._followed = deque[Followed](maxlen=2 * FOLLOWED.depth)
         for form, kind, read in (
             ("profile", ProfileMessage, from_message),
             ("waveform", WaveformMessage, Waveform.of),
@@ -536,10 +546,13 @@ class Finger:
         if state is None:
             return math.nan
         # Profiles and waveforms come on two topics, so in which order they were said is not known.
-        newest = {type(signal): (heard, signal) for heard, signal in tuple(self._followed)}
-        for heard, signal in sorted(newest.values(), key=lambda one: one[0], reverse=True):
+        newest = {type(one.signal): one for one in tuple(self._followed)}
+        for heard, stamp, signal in sorted(
+            newest.values(), key=lambda one: one.heard, reverse=True
+        ):
+            is_newer = heard > self._heard and stamp > seconds(state.header.stamp)
             then = float(signal.at(state.samples * state.period))
-            if heard > self._heard or abs(then - state.reference) <= NEAR:
+            if is_newer or abs(then - state.reference) <= NEAR:
                 return float(signal.at(elapsed))
         return state.reference
 
@@ -661,7 +674,7 @@ class Finger:
         publisher.publish(message(signal))
 
         def is_followed() -> bool:
-            return any(heard > sent and same(signal, s) for heard, s in tuple(self._followed))
+            return any(f.heard > sent and same(signal, f.signal) for f in tuple(self._followed))
 
         def is_refused() -> bool:
             return self.ros.said(node, "refused") != before
@@ -758,7 +771,9 @@ class Finger:
         """
         recorder = self.node("recorder")
         if self.ros.lifecycle(recorder) == "active":
-            raise ClientError(f"'{recorder}' is recording already")
+            raise ClientError(
+                f"'{recorder}' is recording already; `fingerctl record off` ends that"
+            )
         self.ros.set_parameters(recorder, {"bag": bag})
         if self.ros.lifecycle(recorder) == "unconfigured":
             self.ros.lifecycle(recorder, "configure")
@@ -769,11 +784,14 @@ class Finger:
     def end_record(self) -> None:
         """Let the recorder finish its bag."""
         recorder = self.node("recorder")
+        if self.ros.lifecycle(recorder) != "active":
+            raise ClientError(f"'{recorder}' is not recording")
         self.ros.lifecycle(recorder, "deactivate")
         self.ros.lifecycle(recorder, "cleanup")
 
     def _on_followed(self, read: Callable[[Any], Signal], message: Any) -> None:
-        self._followed.append((time.monotonic(), read(message)))
+        stamp = seconds(message.header.stamp)
+        self._followed.append(Followed(time.monotonic(), stamp, read(message)))
 
     def _on_state(self, state: FingerState) -> None:
         self._heard = time.monotonic()
