@@ -23,7 +23,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -205,6 +205,17 @@ def uncovered(
             f"{reach[0] * 1e6:.4g} to {reach[1] * 1e6:.4g} µm"
         )
     return found
+
+
+def is_limited(
+    parameters: FeedbackParameters, command: Any, reference: Any, by_controller: bool
+) -> Any:
+    """Say where a command (m) is held at an end of its range; numbers or arrays.
+
+    A reference that passes through, so not `by_controller`, and is the end itself is not held there.
+    """
+    at_end = (command <= parameters.command_low) | (command >= parameters.command_high)
+    return at_end & (by_controller | (command != reference))
 
 
 class FeedbackCoefficients(NamedTuple):

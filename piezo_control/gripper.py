@@ -30,6 +30,9 @@ from piezo_control.touch import TouchParameters
 SMALLEST = 1e-9
 """Slowest speed (m/s) of a goal: less is a mistake, no motion."""
 
+ROUNDING = 1e-9
+"""An opening that is no further (m) beyond an end of the reach is that end, rounded by who wrote it down."""
+
 HOLD_BEYOND = 1e-6
 """How far (m) a reference stays ahead of a tip that holds a force."""
 
@@ -125,6 +128,13 @@ def reach(parameters: GripperParameters) -> tuple[float, float]:
     return narrowest, round(p.rest_opening - 2.0 * p.deflection_low, 12)
 
 
+def within_reach(parameters: GripperParameters, opening: float) -> float:
+    """Return an opening (m), moved to the end of the reach where that is a matter of rounding."""
+    narrowest, widest = reach(parameters)
+    nearest = min(max(opening, narrowest), widest)
+    return nearest if abs(opening - nearest) <= ROUNDING else opening
+
+
 def check_goal(
     parameters: GripperParameters, opening: float, max_force: float, speed: float
 ) -> Goal:
@@ -133,6 +143,7 @@ def check_goal(
     Raises ValueError naming value and allowed range.
     """
     p = parameters
+    opening = within_reach(p, opening)
     goal = Goal(opening, max_force or p.force_limit, speed or p.speed)
     narrowest, widest = reach(p)
     for name, low, high, unit in (
@@ -156,6 +167,7 @@ def check_trajectory(
     p = parameters
     narrowest, widest = reach(p)
     before = Waypoint(0.0, opening)
+    waypoints = [Waypoint(w.time, within_reach(p, w.opening)) for w in waypoints]
     for number, waypoint in enumerate(waypoints):
         if not narrowest <= waypoint.opening <= widest:
             raise ValueError(

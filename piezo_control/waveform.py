@@ -111,7 +111,15 @@ class Waveform:
     @property
     def largest(self) -> float:
         """Size that no value exceeds."""
-        return abs(self.offset) + abs(self.amplitude)
+        return max(map(abs, self.ends))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The lowest and the highest value that it may have."""
+        turns = [self.offset + self.amplitude, self.offset]
+        if self.shape != "step":
+            turns.append(self.offset - self.amplitude)
+        return min(turns), max(turns)
 
     def at(self, time: ArrayLike) -> NDArray[np.float64]:
         """Return the values at `time` (s since sample 0, any shape)."""

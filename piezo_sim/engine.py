@@ -28,6 +28,7 @@ from piezo_control.feedback import (
     FeedbackParameters,
     FeedbackState,
     feedback_step,
+    is_limited,
 )
 from piezo_control.feedforward import (
     FeedforwardCoefficients,
@@ -204,10 +205,9 @@ def run(
         compiled,
     )
     made = replace(made, reference=reference.at(made.time))
-    at_end = (made.command <= feedback.command_low) | (made.command >= feedback.command_high)
-    if feedback.controller == "none":
-        at_end &= made.command != made.reference
-    return replace(made, limited=np.maximum(made.limited, at_end))
+    by_controller = feedback.controller != "none"
+    held = is_limited(feedback, made.command, made.reference, by_controller)
+    return replace(made, limited=np.maximum(made.limited, held))
 
 
 def run_sensorless(

@@ -16,10 +16,13 @@ from rich.console import Console
 
 from piezo_control.nodes import fingerctl
 from piezo_control.nodes.client import LEAD_TIME, ClientError, connect
+from piezo_control.nodes.profile_input import waveform_message
+from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import WAVEFORM_TYPE, read
 from piezo_control.waveform import Waveform
-from piezo_gripper_msgs.msg import FingerState
+from piezo_gripper_msgs.msg import FingerState, Profile, Sample
+from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 180.0  # s, generous: the tests wait on conditions
@@ -123,7 +126,11 @@ def test_waveform_is_followed_sample_by_sample_and_recorded(finger, tmp_path):
     finger.wait_for(lambda: finger.newest().deflection > 6.5e-6)
     seen = finger.newest().time
     finger.wait_for(lambda: finger.newest().time > seen + 0.2)
+    with pytest.raises(ClientError, match="is recording already; `fingerctl record off` ends that"):
+        finger.record()
     finger.end_record()
+    with pytest.raises(ClientError, match="'/finger/recorder' is not recording$"):
+        finger.end_record()
     finger.zero()
     (message,) = open_bag(tmp_path / "bag").messages("/finger/reference_waveform", WAVEFORM_TYPE)
     followed = Waveform.of(message)
@@ -139,17 +146,81 @@ def test_waveform_is_followed_sample_by_sample_and_recorded(finger, tmp_path):
     assert np.ptp(recording.deflection[runs]) == pytest.approx(10e-6, rel=0.05)
 
 
-def test_waveform_too_fast_for_the_loop_is_ignored_and_too_large_ones_are_refused(finger):
+def test_waveforms_too_fast_for_the_loop_and_too_large_ones_are_refused(finger):
     finger.set(3e-6)
     finger.wait_for(near(finger, 3e-6))
     with pytest.raises(ClientError, match="the waveform goes up to 0.002 m"):
         finger.wave(Waveform("sine", amplitude=2e-3, frequency=1.0))
     with pytest.raises(ClientError, match=r"deflection is 10 m, must be within ±0.001 m: metres\?"):
         finger.set(10.0)
-    finger.wave(Waveform("sine", amplitude=5e-6, frequency=6000.0))
+    with pytest.raises(
+        ClientError, match="'reference_waveform' ignored: frequency is up to 6000 Hz"
+    ):
+        finger.wave(Waveform("sine", amplitude=5e-6, frequency=6000.0))
+    assert finger.newest().reference == 3e-6
     sent = finger.newest().time
     finger.wait_for(lambda: finger.newest().time > sent + 0.1)
     assert near(finger, 3e-6)()
+
+
+def test_the_reference_is_the_one_that_is_followed_also_for_who_joins_later(ros, finger):
+    profiles = ros.node.create_publisher(Profile, "/finger/reference_profile", LATCHED)
+    waveforms = ros.node.create_publisher(WaveformMessage, "/finger/reference_waveform", SETPOINT)
+    for publisher in (profiles, waveforms):
+        finger.wait_for(lambda p=publisher: p.get_subscription_count() > 0)
+    profiles.publish(Profile(time=[0.0], value=[4e-6]))
+    finger.wait_for(near(finger, 4e-6))
+    finger.set(6e-6)
+    finger.wait_for(lambda: finger.newest().reference == 6e-6)
+    with connect(TIMEOUT) as later:
+        late = later.finger("finger")
+        late.wait_for(lambda: late.state is not None)
+        assert late.newest().reference == 6e-6
+        wave = Waveform("sine", amplitude=5e-6, frequency=2.0)
+        waveforms.publish(waveform_message(wave))
+        for one in (finger, late):
+            one.wait_for(lambda one=one: one.newest().reference not in (4e-6, 6e-6))
+    with connect(TIMEOUT) as later:
+        late = later.finger("finger")
+
+        def is_smooth():
+            reading = late.newest()
+            return abs(reading.reference - wave.at(reading.time)) < 1e-12
+
+        late.wait_for(is_smooth)
+        for _ in range(20):  # looks between two states see it move, too
+            assert is_smooth()
+    ros.node.destroy_publisher(profiles)
+    ros.node.destroy_publisher(waveforms)
+    finger.zero()
+    finger.wait_for(near(finger, 0.0))
+
+
+def test_what_a_finger_cannot_follow_is_refused_naming_its_reach(ros, control, capsys, finger):
+    """Commands of `robust` end at ±22 µm, as in its file."""
+    assert finger.reach() == (-22e-6, 22e-6)
+    before = finger.newest().reference
+    for words in (["set", "30"], ["wave", "sine", "--amplitude-um", "500", "--frequency-hz", "1"]):
+        assert control(*words)[0] == 1
+        assert "'/finger' has commands of -22 to 22 µm" in capsys.readouterr().err
+    assert finger.newest().reference == before
+    ros.set_parameters("/finger/feedback", {"command_high": 5e-6})
+    with pytest.raises(ClientError, match="goes to 6 µm, '/finger' has commands of -22 to 5 µm"):
+        finger.set(6e-6)
+    ros.set_parameters("/finger/feedback", {"command_high": 22e-6})
+    finger.home()  # to both ends, and not beyond
+
+
+def test_a_command_at_its_end_counts_as_limited(ros, finger):
+    set_points = ros.node.create_publisher(Sample, "/finger/reference", SETPOINT)
+    finger.wait_for(lambda: set_points.get_subscription_count() > 0)
+    before = finger.state.clipped
+    set_points.publish(Sample(value=30e-6))
+    finger.wait_for(lambda: finger.newest().command == 22e-6)
+    finger.wait_for(lambda: finger.state.clipped > before + 1000)
+    finger.zero()
+    finger.wait_for(near(finger, 0.0))
+    ros.node.destroy_publisher(set_points)
 
 
 def test_controllers_take_over_and_open_loop_is_one(ros, finger):
@@ -167,15 +238,24 @@ def test_stopped_finger_is_at_rest_and_starts_again(finger):
     finger.wait_for(near(finger, 5e-6))
     finger.stop()
     finger.wait_for(lambda: finger.words() == "idle" and finger.state.voltage == 0.0)
+    with pytest.raises(
+        ClientError, match="does not move, it is idle; `fingerctl start` lets it run"
+    ):
+        finger.set(2e-6)
     finger.start()
     finger.wait_for(lambda: finger.words() == "running" and near(finger, 5e-6)())
 
 
-def test_fault_is_in_words_and_reset_ends_it(ros, finger):
+def test_fault_is_in_words_and_reset_ends_it(ros, finger, control, capsys):
     """A `feedforward` that is deactivated answers nothing, which ends a run in lock-step."""
     ros.lifecycle("/finger/feedforward", "deactivate")
     finger.wait_for(lambda: finger.state.phase == FingerState.FAULT)
     assert "fault: no answer to sample" in finger.words()
+    wave = ["wave", "sine", "--amplitude-um", "1", "--frequency-hz", "1"]
+    for words in (["set", "1"], wave, ["zero"], ["home"]):
+        assert control(*words)[0] == 1
+        assert "fault: no answer to sample" in (said := capsys.readouterr().err)
+        assert "`fingerctl reset` goes on" in said
     way_on = "service '/finger/cantilever/reset' (`fingerctl reset`) or a new activation goes on"
     assert way_on in ros.log.read_text()
     ros.lifecycle("/finger/feedforward", "activate")
@@ -198,11 +278,16 @@ def test_fingerctl_moves_and_shows(control, finger):
     assert control("wave", *wave) == (0, "")
 
 
-def test_fingerctl_lifecycle_and_parameters(control):
+def test_fingerctl_lifecycle_and_parameters(ros, control):
     assert control("lifecycle", "temperature") == (0, "/finger/temperature: active\n")
     assert "/finger/recorder: unconfigured\n" in control("lifecycle")[1]
     code, text = control("params", "cantilever")
     assert yaml.safe_load(text)["sample_time"] == SAMPLE_TIME
+    narrow = io.StringIO()  # as a pipe is; lines stay whole
+    fingerctl.carry_out(
+        ros, fingerctl.parse(["params", "cantilever"]), Console(file=narrow, width=20)
+    )
+    assert narrow.getvalue() == text
     assert control("params", "cantilever", "hold_time", "1") == (0, "")
     assert control("params", "cantilever", "hold_time") == (0, "{hold_time: 1.0}\n")
 
@@ -225,6 +310,25 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
             "refuses: Parameter hold_time out of range",
         ),
         (["params", "cantilever", "hold"], 1, "has no parameter 'hold'"),
+        (
+            ["params", "cantilever", "hold_time", "[1"],
+            2,
+            "'hold_time' is '[1', must be YAML: while",
+        ),
+        (
+            ["params", "cantilever", "hold_time", "{a: 1}"],
+            2,
+            "'hold_time' is {'a': 1}, must be a number",
+        ),
+        (
+            ["params", "/bad name", "hold_time"],
+            2,
+            "'/bad name' cannot be: namespace must not contain",
+        ),
+        (["-f", "bad name!", "state"], 2, "'bad name!' cannot be: namespace must not contain"),
+        (["grip", "30", "--gripper", "1x"], 2, "'1x' cannot be: namespace must not have a token"),
+        # The sensor's quantum is 10 nm.
+        (["set", "0.005", "--wait", "--near-um", "0.001"], 1, "µm, not at 0.005 µm: running"),
         (["control", "robst"], 1, "not one of the known"),
         (["wave", "sweep", "--amplitude-um", "1", "--frequency-hz", "1"], 2, "end_frequency is 0"),
         (["set", "1e6"], 1, "deflection is 1 m, must be within"),
@@ -235,7 +339,8 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
         ),
     ],
 )
-def test_fingerctl_says_what_is_refused(control, capsys, words, code, message):
+def test_fingerctl_says_what_is_refused(ros, control, capsys, monkeypatch, words, code, message):
+    monkeypatch.setattr(ros, "timeout", 10.0)
     assert control(*words)[0] == code
     assert message in capsys.readouterr().err
 

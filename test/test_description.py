@@ -9,7 +9,7 @@ import pytest
 import xacro
 import yaml
 
-from piezo_control.gripper import reach
+from piezo_control.gripper import GripperParameters, check_goal, reach
 from piezo_control.nodes.gripper import GripperNodeParameters
 
 FOLDER = Path(__file__).resolve().parents[1] / "description"
@@ -83,6 +83,26 @@ def test_arguments_are_the_parameters():
     assert numbers(joint(root, "j").find("limit"), "lower", "upper") == pytest.approx([8e-5, 16e-5])
     assert numbers(joint(root, "l").find("limit"), "lower", "upper") == pytest.approx([-3e-5, 1e-5])
     assert joint(root, "r").find("mimic").get("joint") == "j"
+
+
+@pytest.mark.parametrize(
+    "rest_um, low_um, high_um", [(60, -30, 20), (70, -17.5, 0.3), (40, -20, 20)]
+)
+def test_limits_of_the_joint_are_openings_that_the_node_takes(rest_um, low_um, high_um):
+    values = {"rest_opening": rest_um, "deflection_low": low_um, "deflection_high": high_um}
+    root = described(**{name: f"{um}e-6" for name, um in values.items()})
+    parameters = GripperParameters(**{name: float(f"{um}e-6") for name, um in values.items()})
+    ends = numbers(joint(root, DEFAULTS.joint).find("limit"), "lower", "upper")
+    assert ends == list(reach(parameters))
+    for end in ends:
+        assert check_goal(parameters, end, 0.0, 0.0).opening == end
+
+
+def test_tips_that_would_cross_are_refused():
+    with pytest.raises(
+        xacro.XacroException, match="deflection_high is 1.5e-05 m: the tips would cross"
+    ):
+        described(rest_opening="20e-6", deflection_high="15e-6")
 
 
 @pytest.mark.parametrize("opening", [0.0, 40e-6, 70e-6])

@@ -20,20 +20,24 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from rclpy.experimental.events_executor import EventsExecutor
+from std_srvs.srv import Trigger
 
 from piezo_control.gripper import (
     REST_TIME,
     Goal,
     GripperParameters,
     Motion,
+    Waypoint,
     check_goal,
+    check_trajectory,
     force_of,
     opening_of,
+    reach,
 )
-from piezo_control.nodes.qos import LATCHED
+from piezo_control.nodes.qos import LATCHED, SETPOINT
 from piezo_control.parameters import ParameterError, build
 from piezo_gripper_msgs.action import Grip
-from piezo_gripper_msgs.msg import FingerState
+from piezo_gripper_msgs.msg import FingerState, Sample
 from piezo_gripper_msgs.msg import Profile as ProfileMessage
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
@@ -148,6 +152,17 @@ def test_goal_takes_defaults_for_zero():
 def test_goal_out_of_range_is_named(goal, message):
     with pytest.raises(ValueError, match=message):
         check_goal(DEFAULTS, *goal)
+
+
+@pytest.mark.parametrize("off", [-0.9e-9, -1e-20, 1e-20, 0.9e-9])
+def test_an_end_of_the_reach_that_was_rounded_is_that_end(off):
+    for end in reach(DEFAULTS):
+        opening = min(max(end + off, 0.0), 80e-6)
+        assert check_goal(DEFAULTS, end + off, 0.0, 0.0).opening in (opening, end)
+        way = check_trajectory(DEFAULTS, [Waypoint(1.0, end + off)], 40e-6)
+        assert way.opening in (opening, end)
+    with pytest.raises(ValueError, match="must be in"):
+        check_goal(DEFAULTS, -1.1e-9, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -357,6 +372,28 @@ def test_new_goal_takes_over_and_the_old_one_is_aborted(bench):
     answer = bench.result_of(new.get_result_async())
     assert answer.status == GoalStatus.STATUS_SUCCEEDED
     assert "a new goal takes over" in bench.log.read_text()
+
+
+@pytest.mark.parametrize("asks", ["grip", "stop"])
+def test_motion_and_stop_begin_where_somebody_else_has_left_the_reference(bench, asks):
+    place = -3e-6  # m, of the left finger alone; the gripper left it at 0
+    set_points = bench.node.create_publisher(Sample, "left/reference", SETPOINT)
+    bench.wait(lambda: set_points.get_subscription_count() > 0)
+    set_points.publish(Sample(value=place))
+    bench.wait(lambda: bench.states["left"].reference == place)
+    bench.wait(lambda: abs(bench.states["left"].deflection - place) < 0.2e-6)
+    # The gripper has heard a state as new as that.
+    number = bench.states["left"].samples
+    bench.wait(lambda: bench.states["left"].samples > number + 1000)
+    if asks == "grip":
+        bench.moving(bench.send(36e-6, 0.0, SLOW))
+    else:
+        stop = bench.node.create_client(Trigger, "gripper/stop")
+        bench.wait(stop.service_is_ready)
+        bench.result_of(stop.call_async(Trigger.Request()))
+        bench.wait(lambda: bench.references["left"])
+    # Stopped, it is held no further ahead of its tip than it was.
+    assert bench.references["left"][0].value[0] == pytest.approx(place, abs=0.2e-6)
 
 
 @pytest.mark.shows("a gripper that is gone")

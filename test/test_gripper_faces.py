@@ -193,6 +193,29 @@ def test_a_repeated_command_does_not_push_anew(faces):
     assert faces.bench.log.read_text().count("stopped by") == stops
 
 
+@pytest.mark.parametrize("between", ["home", "stop", "trajectory"])
+def test_a_repeated_command_is_held_back_after_something_else_and_says_so_once(faces, between):
+    bench, words = faces.bench, "'/gripper/joint_commands' repeats 37 µm, held back"
+    for opening in (36e-6, 37e-6, 37e-6):
+        faces.command(opening)
+        faces.arrives(opening)
+    if between == "trajectory":
+        point = JointTrajectoryPoint(positions=[38e-6], time_from_start=Duration(sec=1))
+        faces.trajectories.publish(JointTrajectory(joint_names=[JOINT], points=[point]))
+        faces.arrives(38e-6)
+    else:
+        assert faces.call(f"gripper/{between}").success
+    before = bench.log.read_text().count(words)
+    for _ in range(3):
+        faces.command(37e-6)
+        bench.wait(lambda: bench.log.read_text().count(words) == before + 1)
+    faces.command(36.5e-6)
+    faces.arrives(36.5e-6)
+    faces.command(37e-6)
+    faces.arrives(37e-6)
+    assert bench.log.read_text().count(words) == before + 1
+
+
 def test_a_trajectory_is_followed_in_the_fingers_own_time(faces):
     for sent in faces.bench.references.values():
         sent.clear()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a panel: what it keeps and draws, and all of it in a real browser in front of a running gripper."""
 
+import asyncio
 import http.client
 import math
 import os
@@ -18,6 +19,7 @@ import pytest
 from ament_index_python.packages import get_package_prefix
 from bokeh.events import ButtonClick
 
+from piezo_control.nodes import panel as panel_node
 from piezo_control.nodes.client import ClientError, connect
 from piezo_control.nodes.qos import SAMPLE
 from piezo_control.panel.cards import Card, Gauge, Message, render
@@ -149,7 +151,7 @@ def recorded():
         button = bench.widgets[name]
         button._trigger_event(ButtonClick(button))
 
-    bench.press = press
+    bench.controls, bench.press = controls, press
     return bench
 
 
@@ -182,6 +184,66 @@ def test_steps_go_on_from_what_is_in_the_field(recorded):
     assert recorded.refused == [
         ("+1", "the set-point is 'three', must be a number in µm, such as 2.5")
     ]
+
+
+def test_steps_go_on_from_the_reference_of_each_finger_whatever_the_field_holds(recorded):
+    for finger, um in zip(recorded.fingers.values(), (10.0, -5.0)):
+        finger.newest = lambda um=um: SimpleNamespace(reference=um * 1e-6)
+    recorded.controls.follow()
+    assert recorded.widgets["set_point"].value_input == "10"
+    assert recorded.widgets["slider"].value == pytest.approx(10.0)
+    recorded.widgets["set_point"].value_input = "0"  # typed, and forgotten
+    recorded.press("step2")
+    recorded.press("step2")  # sooner than a finger can have answered
+    recorded.widgets["choice"].active = 2
+    recorded.press("step2")
+    assert [(name, um * 1e6) for name, _, um in recorded.asked] == [
+        (name, pytest.approx(um))
+        for name, um in (("/left", 10.1), ("/left", 10.2), ("/left", 10.3), ("/right", -4.9))
+    ]
+
+
+def test_field_and_slider_follow_the_reference_unless_somebody_is_at_them(recorded, monkeypatch):
+    monkeypatch.setattr("piezo_control.panel.controls.ANSWER_TIME", 0.0)
+    field, slider = recorded.widgets["set_point"], recorded.widgets["slider"]
+    um = 12.345
+
+    def newest():
+        return SimpleNamespace(reference=um * 1e-6)
+
+    recorded.fingers["/left"].newest = recorded.fingers["/right"].newest = newest
+    recorded.controls.follow()
+    assert (field.value, field.value_input) == ("12.345", "12.345")
+    recorded.press("go")  # what is shown is where the finger is
+    assert recorded.asked[-1][2] == pytest.approx(um * 1e-6, abs=1e-15)
+    field.value_input = "3"  # typed, and not yet sent
+    um = 4.0
+    recorded.controls.follow()
+    assert (field.value_input, slider.value) == ("3", pytest.approx(4.0))
+    recorded.press("zero")
+    slider.value = 7.0  # on the way, not yet let go of
+    recorded.controls.follow()
+    assert (field.value_input, slider.value) == ("4", 7.0)
+    um = math.nan  # nobody has told one
+    recorded.controls.follow()
+    assert (field.value_input, slider.value) == ("4", 7.0)
+
+
+def test_what_a_panel_does_again_and_again_goes_on_after_something_went_wrong(caplog, monkeypatch):
+    monkeypatch.setattr(panel_node, "REVIEW_PERIOD", 0.0)
+    done = []
+
+    async def act():
+        done.append(len(done))
+        if len(done) == 1:
+            raise RuntimeError("once")
+        if len(done) == 3:
+            raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(panel_node.repeat(act))
+    assert done == [0, 1, 2]
+    assert "RuntimeError: once" in caplog.text
 
 
 # --- in a browser -------------------------------------------------------------------------------------
@@ -341,6 +403,17 @@ def test_set_point_moves_the_finger_and_its_trace(page, left):
     )
     page.press("zero")
     left.wait_for(near(left, 0.0))
+
+
+def test_a_step_on_a_new_page_begins_where_the_finger_is(panel, browser, left):
+    left.set(6e-6)
+    context = browser.new_context()
+    page = Page(context, panel.address)
+    page.choose("/left")
+    page.press("step2")
+    page.shows("/left: set-point 6.1 µm: done", ".messages")
+    left.wait_for(lambda: abs(left.newest().reference - 6.1e-6) < 1e-12)
+    context.close()
 
 
 @pytest.mark.parametrize(
@@ -508,6 +581,7 @@ def test_command_line():
     for words, code, said in (
         (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: [Errno 99] Cannot assign"),
         (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
+        (["-f", "bad name"], 2, "panel: error: 'bad name' cannot be: namespace must not contain"),
     ):
         done = subprocess.run(
             [EXECUTABLES / "panel", *words], capture_output=True, text=True, timeout=TIMEOUT

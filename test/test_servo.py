@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 from piezo_control.design.cli import read_problem
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.client import LEAD_TIME, ClientError, connect
 from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
 from piezo_control.nodes.profile_input import waveform_message
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
@@ -725,3 +726,37 @@ def test_what_cannot_start_says_why(tmp_path, arguments, text):
         servo.terminate()
         assert servo.wait(TIMEOUT) == 0
     assert "Traceback" not in log.read_text()
+
+
+def test_the_client_moves_a_servo_and_hears_what_it_follows(tmp_path):
+    # Other processes share this machine, so nothing is said here about time.
+    command = [EXECUTABLES / "servo", "--ros-args", "-r", "__ns:=/real"]
+    for name, value in (
+        ("driver", "simulated"), ("late_share", 1.0), ("missed_limit", 10**6), ("hold_time", 5.0),
+    ):  # fmt: skip
+        command += ["-p", f"{name}:={value}"]
+    with (tmp_path / "servo.log").open("wb") as log:
+        servo = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+    try:
+        with connect(2 * TIMEOUT) as ros:
+            finger = ros.finger("real")
+            finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+            finger.wave(Waveform("triangle", 5e-6, frequency=2.0, offset=10e-6))
+            start = finger.newest().time + LEAD_TIME
+            finger.wait_for(lambda: finger.newest().time > start)
+            seen = [finger.newest().reference for _ in range(20)]
+            assert all(5e-6 <= reference <= 15e-6 for reference in seen)
+            finger.set(5e-6)
+            finger.wait_for(lambda: finger.newest().reference == 5e-6)
+            low, high = finger.reach()
+            assert (low, high) == (ROBUST.command_low, ROBUST.command_high)
+            with pytest.raises(ClientError, match=f"of {low * 1e6:g} to {high * 1e6:g} µm"):
+                finger.set(high + 1e-6)
+            before = finger.state.clipped
+            beyond = ros.node.create_publisher(Sample, "/real/reference", SETPOINT)
+            finger.wait_for(lambda: beyond.get_subscription_count() > 0)
+            beyond.publish(Sample(value=high + 5e-6))
+            finger.wait_for(lambda: finger.state.clipped > before + 1000)
+    finally:
+        servo.terminate()
+        assert servo.wait(TIMEOUT) == 0, (tmp_path / "servo.log").read_text()

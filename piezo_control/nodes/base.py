@@ -308,6 +308,7 @@ class FingerNode(LifecycleNode):
             self.parameters = build(self.PARAMETERS, self._values({}), self.NAME)
             if self.active:
                 self.apply()
+                self.publish_diagnostics()
 
 
 def parameter_type(cls: type, name: str) -> Parameter.Type:

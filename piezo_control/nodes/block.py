@@ -18,6 +18,7 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
+from piezo_control.feedback import FeedbackParameters
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, NEWEST, SAMPLE
@@ -27,6 +28,11 @@ from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 
 SIMULATED_TIME = 1e8  # s: a stamp below is no time of a clock on a wall
+
+
+def command_range(controller: FeedbackParameters) -> dict[str, float]:
+    """Return the ends of a controller's command, as figures for `/diagnostics`."""
+    return {f"{name} [m]": getattr(controller, name) for name in ("command_low", "command_high")}
 
 
 def seconds(stamp: Any) -> float:

@@ -22,19 +22,21 @@ import os
 import queue
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.action import ActionClient
 from rclpy.context import Context
-from rclpy.duration import Duration
+from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -42,22 +44,26 @@ from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from rclpy.validate_namespace import validate_namespace
 from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
 from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.gripper import GripperParameters, check_goal, reach
+from piezo_control.nodes.block import seconds
 from piezo_control.nodes.parameters import ServoNodeParameters, read_feedforward
 from piezo_control.nodes.phases import PHASES
-from piezo_control.nodes.profile_input import ProfileInput, waveform_message
-from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.nodes.profile_input import from_message, waveform_message
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SETPOINT
 from piezo_control.nodes.spin import LONGEST_WAIT
 from piezo_control.parameters import build, declarations, flatten
+from piezo_control.profile import Profile, Signal
 from piezo_control.safety import LARGEST_DEFLECTION
 from piezo_control.start import LOOK_PERIOD, Stop
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
+from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
 ASK_AGAIN = 0.5  # s, for what can be asked more than once
@@ -68,6 +74,14 @@ HOMING = {"frequency": 5.0, "duration": 2.0}  # Hz and s of the decaying sine
 LATEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 STATE_TYPE = "piezo_gripper_msgs/msg/FingerState"
 CHANGE_STATE = "/change_state"
+NEAR = 1e-9  # m: what is told apart from rounding
+WAYS_ON = {
+    FingerState.IDLE: "`fingerctl start` lets it run",
+    FingerState.FAULT: "`fingerctl reset` goes on when the cause is gone",
+    FingerState.RAMPING: "`fingerctl reset` goes on when the cause is gone",
+    FingerState.FINISHED: "`fingerctl stop` and `fingerctl start` begin a new run",
+}
+"""Phases in which a finger follows no reference, and what ends them."""
 FOLLOWERS = ("feedback", "servo")
 """Nodes that follow a reference."""
 LIMITERS = ("servo", "feedforward")
@@ -107,6 +121,16 @@ class Reading(NamedTuple):
     """N"""
 
 
+class Followed(NamedTuple):
+    """What the loop has said that it follows."""
+
+    heard: float
+    """s, of the monotonic clock"""
+    stamp: float
+    """s, of the first sample at which it does"""
+    signal: Signal
+
+
 class Setup(NamedTuple):
     """What the nodes of a finger are set to: its controller and the limits that act on it."""
 
@@ -126,6 +150,24 @@ class Setup(NamedTuple):
     """V/s"""
     force_limit: float
     """N; NaN for a finger that feels none."""
+
+
+def full_namespace(text: str) -> str:
+    """Return the full namespace that is meant by a text; ValueError where it cannot be one."""
+    full = "/" + text.strip("/")
+    try:
+        validate_namespace(full)
+    except InvalidNamespaceException as error:
+        why = str(error).splitlines()[0].rpartition("namespace: ")[2].rstrip(":")
+        raise ValueError(f"'{text}' cannot be: {why}") from None
+    return full
+
+
+def same(one: Signal, other: Signal) -> bool:
+    """Say whether two signals are the same function of time."""
+    return type(one) is type(other) and all(
+        map(np.array_equal, *(vars(s).values() for s in (one, other)))
+    )
 
 
 def own(parameters: type, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -193,7 +235,7 @@ class Ros:
     def finger(self, namespace: str = "") -> Finger:
         """Return the finger in a namespace, or, when none is named, the only one that is there."""
         if namespace:
-            return Finger(self, "/" + namespace.strip("/"))
+            return Finger(self, full_namespace(namespace))
         self.wait(lambda: bool(self.fingers()), lambda: "no finger is running in this ROS domain")
         found = self.fingers()
         if len(found) > 1:
@@ -269,7 +311,14 @@ class Ros:
     def set_parameters(self, node: str, values: Mapping[str, Any]) -> None:
         """Set parameters of a node, all or none; ClientError with the reason if it refuses."""
         client = self._parameter_client(node)
-        changes = [Parameter(name, value=value) for name, value in values.items()]
+        changes = []
+        for name, value in values.items():
+            try:
+                changes.append(Parameter(name, value=value))
+            except TypeError:
+                raise ValueError(
+                    f"'{name}' is {value}, must be a number, true or false, a text or a list of one of them"
+                ) from None
         result = self.result(client.set_parameters_atomically(changes), node).result
         if not result.successful:
             raise ClientError(f"'{node}' refuses: {result.reason}")
@@ -280,7 +329,7 @@ class Ros:
 
     def gripper(self, namespace: str = "") -> Gripper:
         """Return the gripper in a namespace."""
-        return Gripper(self, "/" + f"{namespace.strip('/')}/gripper".strip("/"))
+        return Gripper(self, f"{full_namespace(namespace).rstrip('/')}/gripper")
 
     def ask(self, who: str, ask: Callable[..., Future], *words: Any, timeout: float = 0.0) -> Any:
         """Return what an action answers.
@@ -447,8 +496,17 @@ class Finger:
         self._heard = -math.inf
         node, watcher = ros.node, ros.watcher
         node.create_subscription(FingerState, f"{self.prefix}state", self._on_state, LATCHED)
-        # Which frequencies its loop can follow the finger says, so here any sample time will do.
-        self._reference = ProfileInput(node, f"{self.prefix}reference", 1e-6, LARGEST_DEFLECTION)
+        self._followed = deque[Followed](maxlen=2 * FOLLOWED.depth)
+        for form, kind, read in (
+            ("profile", ProfileMessage, from_message),
+            ("waveform", WaveformMessage, Waveform.of),
+        ):
+            node.create_subscription(
+                kind,
+                f"{self.prefix}reference_followed_{form}",
+                partial(self._on_followed, read),
+                FOLLOWED,
+            )
         self._set_points = node.create_publisher(Sample, f"{self.prefix}reference", SETPOINT)
         self._waveforms = node.create_publisher(
             WaveformMessage, f"{self.prefix}reference_waveform", SETPOINT
@@ -483,10 +541,20 @@ class Finger:
         )
 
     def _reference_at(self, elapsed: float) -> float:
-        """Return the reference (m) that was sent since this client began, or else that of the finger's state."""
-        if self._reference.is_known:
-            return float(self._reference.signal.at(elapsed))
-        return self.state.reference if self.state else math.nan
+        """Return the reference (m) that is followed, by what the loop says and the finger's state agrees with."""
+        state = self.state
+        if state is None:
+            return math.nan
+        # Profiles and waveforms come on two topics, so in which order they were said is not known.
+        newest = {type(one.signal): one for one in tuple(self._followed)}
+        for heard, stamp, signal in sorted(
+            newest.values(), key=lambda one: one.heard, reverse=True
+        ):
+            is_newer = heard > self._heard and stamp > seconds(state.header.stamp)
+            then = float(signal.at(state.samples * state.period))
+            if is_newer or abs(then - state.reference) <= NEAR:
+                return float(signal.at(elapsed))
+        return state.reference
 
     @property
     def is_silent(self) -> bool:
@@ -516,7 +584,12 @@ class Finger:
             raise ClientError(
                 f"deflection is {deflection:g} m, must be within ±{LARGEST_DEFLECTION:g} m: metres?"
             )
-        self._send(self._set_points, lambda: Sample(value=deflection))
+        self._need_reach(deflection, deflection)
+        self._send(
+            self._set_points,
+            lambda: Profile([0.0], [deflection]),
+            lambda s: Sample(value=s.value[0]),
+        )
 
     def zero(self) -> None:
         """Let the finger go to a deflection of 0 and stay there."""
@@ -538,28 +611,81 @@ class Finger:
             raise ClientError(
                 f"the waveform goes up to {waveform.largest:g} m, must be within ±{LARGEST_DEFLECTION:g} m"
             )
+        self._need_reach(*waveform.ends)
         self.wait_for(lambda: self.newest().time >= 0.0)
+        self._send(
+            self._waveforms,
+            lambda: replace(waveform, start=self.newest().time + LEAD_TIME),
+            waveform_message,
+        )
 
-        def message() -> WaveformMessage:
-            return waveform_message(replace(waveform, start=self.newest().time + LEAD_TIME))
+    def reach(self) -> tuple[float, float]:
+        """Return the lowest and the highest command (m) of the finger's loop; no reference is followed beyond."""
+        node = self._follower()
+        ends = [self.ros.said(node, f"command_{end} [m]") for end in ("low", "high")]
+        if not all(ends):
+            return -math.inf, math.inf  # it is not active, or says none
+        return float(ends[0]), float(ends[1])
 
-        self._send(self._waveforms, message)
+    def _need_reach(self, lowest: float, highest: float) -> None:
+        """Raise ClientError for a finger that is at rest, or that cannot go from `lowest` to `highest` (m)."""
+        self.wait_for(lambda: self.state is not None)
+        # The state of one that has just been started may be on its way.
+        end = time.monotonic() + ASK_AGAIN
+        while rest := self._rest():
+            if time.monotonic() > end:
+                raise ClientError(rest)
+            time.sleep(LOOK_PERIOD)
+        low, high = self.reach()
+        for value in (lowest, highest):
+            if not low - NEAR <= value <= high + NEAR:
+                raise ClientError(
+                    f"the reference goes to {value * 1e6:g} µm, '{self.namespace}' has commands of "
+                    f"{low * 1e6:g} to {high * 1e6:g} µm"
+                )
 
-    def _send(self, publisher: Any, message: Callable[[], Any]) -> None:
-        """Publish what `message()` returns then, to a node that follows references; see that it arrives."""
+    def _rest(self) -> str:
+        """Return in words that the finger is at rest and what lets it go on; empty: it moves."""
+        way_on = WAYS_ON.get(self.state.phase) if self.state else ""
+        return f"'{self.namespace}' does not move, it is {self.words()}; {way_on}" if way_on else ""
+
+    def _follower(self) -> str:
+        """Return the node that follows references, once it has said how it is."""
+        node = self.node(*FOLLOWERS)
+        self.ros.wait(
+            lambda: node in self.ros.diagnostics, lambda: f"'{node}' is silent on '/diagnostics'"
+        )
+        return node
+
+    def _send(self, publisher: Any, make: Callable[[], Any], message: Callable[[Any], Any]) -> None:
+        """Publish the message of the signal that `make()` returns then; return when it is followed."""
 
         def followers() -> list[str]:
             found = self.ros.node.get_subscriptions_info_by_topic(publisher.topic_name)
             return [one.node_name for one in found if one.node_name in FOLLOWERS]
 
         self.ros.wait(
-            lambda: (
-                bool(followers()) and publisher.get_subscription_count() >= len(followers()) + 1
-            ),
+            lambda: 0 < len(followers()) <= publisher.get_subscription_count(),
             lambda: f"nobody follows '{publisher.topic_name}': {self.words()}",
         )
-        publisher.publish(message())
-        publisher.wait_for_all_acked(Duration(seconds=self.ros.timeout))
+        node = self._follower()
+        before, sent = self.ros.said(node, "refused"), time.monotonic()
+        signal = make()
+        publisher.publish(message(signal))
+
+        def is_followed() -> bool:
+            return any(f.heard > sent and same(signal, f.signal) for f in tuple(self._followed))
+
+        def is_refused() -> bool:
+            return self.ros.said(node, "refused") != before
+
+        self.ros.wait(
+            lambda: is_followed() or is_refused() or bool(self._rest()),
+            lambda: f"'{node}' does not say that it follows: '{self.namespace}' is {self.words()}",
+        )
+        if not is_followed():
+            why = self.ros.said(node, "last refusal")
+            raise ClientError(f"'{node}': {why}" if is_refused() else self._rest())
 
     # --- the loop -----------------------------------------------------------------------------------
 
@@ -645,7 +771,9 @@ class Finger:
         """
         recorder = self.node("recorder")
         if self.ros.lifecycle(recorder) == "active":
-            raise ClientError(f"'{recorder}' is recording already")
+            raise ClientError(
+                f"'{recorder}' is recording already; `fingerctl record off` ends that"
+            )
         self.ros.set_parameters(recorder, {"bag": bag})
         if self.ros.lifecycle(recorder) == "unconfigured":
             self.ros.lifecycle(recorder, "configure")
@@ -656,8 +784,14 @@ class Finger:
     def end_record(self) -> None:
         """Let the recorder finish its bag."""
         recorder = self.node("recorder")
+        if self.ros.lifecycle(recorder) != "active":
+            raise ClientError(f"'{recorder}' is not recording")
         self.ros.lifecycle(recorder, "deactivate")
         self.ros.lifecycle(recorder, "cleanup")
+
+    def _on_followed(self, read: Callable[[Any], Signal], message: Any) -> None:
+        stamp = seconds(message.header.stamp)
+        self._followed.append(Followed(time.monotonic(), stamp, read(message)))
 
     def _on_state(self, state: FingerState) -> None:
         self._heard = time.monotonic()

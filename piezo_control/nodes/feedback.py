@@ -30,9 +30,15 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from piezo_control.design.preview import asked
-from piezo_control.feedback import Feedback, FeedbackParameters, controller_file, successor
+from piezo_control.feedback import (
+    Feedback,
+    FeedbackParameters,
+    controller_file,
+    is_limited,
+    successor,
+)
 from piezo_control.nodes import base
-from piezo_control.nodes.block import BlockNode
+from piezo_control.nodes.block import BlockNode, command_range
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
@@ -214,7 +220,7 @@ class FeedbackNode(BlockNode):
     def report(self) -> tuple[str, dict[str, Any]]:
         wrong, figures = super().report()
         p = self.parameters
-        figures |= {"controller": p.name, "certified": p.certified}
+        figures |= {"controller": p.name, "certified": p.certified, **command_range(p)}
         if p.force_control:
             figures |= {"controller": "force control", "certified": False, "push": self.touch.push}
         return wrong, figures
@@ -259,9 +265,7 @@ class FeedbackNode(BlockNode):
             self._tell_push(sample)
         else:
             return False
-        # A reference that passes through and is the end of the range is not limited.
-        at_end = not p.command_low < answer.value < p.command_high
-        answer.limited = at_end and (answer.by_controller or answer.value != reference)
+        answer.limited = is_limited(p, answer.value, reference, answer.by_controller)
         return True
 
     def _tell_push(self, sample: Sample) -> None:

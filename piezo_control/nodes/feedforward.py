@@ -217,7 +217,7 @@ class FeedforwardNode(BlockNode):
         else:
             answer.value = self.law.step(sample.value, share)
         self.moved = now
-        answer.limited = self.law.clipped > clipped
+        answer.limited = sample.limited or self.law.clipped > clipped
         return True
 
     def _expect(self, sample: Sample) -> None:

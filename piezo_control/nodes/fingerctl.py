@@ -23,7 +23,14 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from piezo_control.nodes.client import TRANSITIONS, ClientError, Finger, Ros, connect
+from piezo_control.nodes.client import (
+    TRANSITIONS,
+    ClientError,
+    Finger,
+    Ros,
+    connect,
+    full_namespace,
+)
 from piezo_control.nodes.overview import ROWS, complaints, ended, in_order
 from piezo_control.options import positive
 from piezo_control.start import stop_at_signals
@@ -69,6 +76,17 @@ def is_near(finger: Finger, target: float, near: float) -> bool:
     return abs(finger.newest().deflection - target) <= near
 
 
+def still(finger: Finger, target: float) -> str:
+    """Return in words where a finger is that should be at a target (m)."""
+    here = finger.newest().deflection
+    return f"'{finger.namespace}' is at {here * 1e6:.3f} µm, not at {target * 1e6:g} µm: {finger.words()}"
+
+
+def say(console: Console, text: str) -> None:
+    """Print a text as it is, whatever is in it and however long its lines are."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
 # --- commands -----------------------------------------------------------------------------------------
 
 
@@ -78,7 +96,7 @@ def list_all(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
     ros.closing.wait(DISCOVERY)
     for finger in (Finger(ros, name) for name in ros.fingers()):
         names = [name.rpartition("/")[2] for name in finger.nodes()]
-        console.print(f"{finger.namespace}: {', '.join(names)}", highlight=False)
+        say(console, f"{finger.namespace}: {', '.join(names)}")
     return 0
 
 
@@ -89,7 +107,7 @@ def state(ros: Ros, arguments: argparse.Namespace, console: Console) -> int:
         finger.wait_for(partial(has_state, finger))
     console.print(overview(chosen))
     for line in complaints(ros):
-        console.print(line, markup=False, highlight=False)
+        say(console, line)
     return int(not all(in_order(finger) for finger in chosen))
 
 
@@ -117,8 +135,8 @@ def set_point(ros: Ros, arguments: argparse.Namespace, console: Console) -> None
     if arguments.wait:
         near = arguments.near_um * 1e-6
         for finger in chosen:
-            finger.wait_for(partial(is_near, finger, target, near))
-            console.print(f"{finger.namespace}: at {finger.newest().deflection * 1e6:.2f} µm")
+            ros.wait(partial(is_near, finger, target, near), partial(still, finger, target))
+            say(console, f"{finger.namespace}: at {finger.newest().deflection * 1e6:.2f} µm")
 
 
 def wave(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
@@ -140,14 +158,14 @@ def reset(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
     """Leave latched faults and print what each node says."""
     for finger in fingers(ros, arguments):
         for name, answer in finger.reset().items():
-            console.print(f"{name}: {answer}", markup=False, highlight=False)
+            say(console, f"{name}: {answer}")
 
 
 def record(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
     """Begin a recording, or end it."""
     for finger in fingers(ros, arguments):
         if arguments.switch == "on":
-            console.print(finger.record(arguments.bag), markup=False, highlight=False)
+            say(console, finger.record(arguments.bag))
         else:
             finger.end_record()
 
@@ -168,7 +186,7 @@ def lifecycle(ros: Ros, arguments: argparse.Namespace, console: Console) -> None
         ros.wait(lambda: bool(ros.nodes()), lambda: "no node with a lifecycle is running")
     for node in [full_name(ros, arguments)] if arguments.node else ros.nodes():
         label = ros.lifecycle(node, arguments.transition)
-        console.print(f"{node}: {label}", markup=False, highlight=False)
+        say(console, f"{node}: {label}")
 
 
 def params(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
@@ -181,11 +199,13 @@ def params(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
     if arguments.value is None:
         chosen = {name: values[name]} if name else values
         plain = {n: list(v) if hasattr(v, "tolist") else v for n, v in chosen.items()}
-        console.print(
-            yaml.safe_dump(plain, default_flow_style=None).rstrip(), markup=False, highlight=False
-        )
+        say(console, yaml.safe_dump(plain, default_flow_style=None, width=math.inf).rstrip())
         return
-    value = yaml.safe_load(arguments.value)
+    try:
+        value = yaml.safe_load(arguments.value)
+    except yaml.YAMLError as error:
+        text = " ".join(str(error).split())
+        raise ValueError(f"'{name}' is '{arguments.value}', must be YAML: {text}") from None
     if isinstance(values[name], float) and type(value) is int:
         value = float(value)
     ros.set_parameters(node, {name: value})
@@ -194,7 +214,7 @@ def params(ros: Ros, arguments: argparse.Namespace, console: Console) -> None:
 def full_name(ros: Ros, arguments: argparse.Namespace) -> str:
     """Return the name of the node that was named: '/finger/feedback', or 'feedback' of the finger."""
     name = arguments.node
-    return name if name.startswith("/") else fingers(ros, arguments)[0].node(name)
+    return full_namespace(name) if name.startswith("/") else fingers(ros, arguments)[0].node(name)
 
 
 # --- what is shown ------------------------------------------------------------------------------------

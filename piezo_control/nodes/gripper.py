@@ -65,6 +65,10 @@ WATCH_PERIOD = 0.1  # s
 VELOCITY_WINDOW = 0.1  # s of the finger's time: the sensor's quantum of 10 nm is 0.1 µm/s then
 PUSH_TIMEOUT = 0.5  # s of the finger's time; pushes come every 10 ms of it
 LEASE = 0.5  # s of the finger's time that a piece of a motion lasts; states come ten a second
+UNDER_WAY = (
+    0.5  # s in which a reference that was sent shows in the finger's state, if it is followed
+)
+SAME = 1e-9  # m: references that differ by less are the same
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +125,8 @@ class Finger:
         self.index = index
         self.state: Any = None  # FingerState; None before the first
         self.reference: Profile | None = None
+        self._under_way: Profile | None = None  # a reference that was sent, until a state shows it
+        self._sent = -math.inf
         self.zero = 0.0  # m, the deflection at which the finger is at rest
         self.heard = monotonic()
         self._way: deque[tuple[float, float]] = deque()  # times (s) and deflections (m) of late
@@ -148,14 +154,17 @@ class Finger:
         return (here - start) / (end - begin) if end > begin else 0.0
 
     def place(self) -> float:
-        """Return where the reference is (m); before the first one, where the finger is."""
-        if self.reference is None:
+        """Return where the reference in force is (m), whoever gave it; where nobody has said, where the finger is."""
+        if self._under_way is not None:
+            return float(self._under_way.at(self.time)) - self.zero
+        if math.isnan(self.state.reference):
             return self.deflection
-        return float(self.reference.at(self.time)) - self.zero
+        return self.state.reference - self.zero
 
     def follow(self, reference: Profile) -> None:
         """Give the finger this reference."""
         self.reference = Profile(reference.time, reference.value + self.zero, reference.linear)
+        self._under_way, self._sent = self.reference, self.heard
         self.extend()
 
     def extend(self) -> None:
@@ -263,9 +272,13 @@ class Finger:
             self._way.append((self.time, state.deflection))
         while len(self._way) > 2 and self.time - self._way[1][0] >= VELOCITY_WINDOW:
             self._way.popleft()
+        if self._under_way is not None and not math.isnan(state.reference):
+            is_shown = abs(state.reference - float(self._under_way.at(self.time))) <= SAME
+            if is_shown or self.heard - self._sent > UNDER_WAY:
+                self._under_way = None  # from here on the state knows better
         if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
             self.follow(hold(0.0))
-            self.reference = None
+            self.reference = self._node.goal = None
         self._on_state(self)
 
 
@@ -278,6 +291,7 @@ class GripperNode(FingerNode):
         self.fingers: list[Finger] = []
         self.motion: Motion | None = None
         self.asker: Asker | None = None  # whose motion it is
+        self.goal: Goal | None = None  # the newest, until the fingers are somewhere else
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
         self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
         self._serve_control_action()
@@ -366,10 +380,11 @@ class GripperNode(FingerNode):
             # Opening keeps the force that is held: the references are ahead of the tips, and more would push on.
             if self.motion.closing or not finger.max_force:
                 finger.max_force = goal.max_force
-        self.asker = asker
+        self.asker, self.goal = asker, goal
 
     def halt(self, reason: str) -> None:
         """Hold the fingers where they are; a motion ends because of `reason`."""
+        self.goal = None
         self._halt_motion(failure(reason))
 
     def zero(self) -> str:

@@ -33,7 +33,15 @@ try:
 except ModuleNotFoundError as error:
     sys.exit(f"panel: {error}: pip install bokeh")
 
-from piezo_control.nodes.client import ClientError, Finger, Gripper, Ros, Setup, connect
+from piezo_control.nodes.client import (
+    ClientError,
+    Finger,
+    Gripper,
+    Ros,
+    Setup,
+    connect,
+    full_namespace,
+)
 from piezo_control.nodes.overview import ROWS, complaints, ended, figure, in_order
 from piezo_control.options import port, positive
 from piezo_control.panel.cards import Card, Gauge, Message
@@ -227,9 +235,12 @@ async def in_thread(workers: Executor, act: Callable[[], Any]) -> Any:
 
 
 async def repeat(act: Callable[[], Awaitable[None]]) -> None:
-    """Do the same again and again."""
+    """Do the same again and again; what goes wrong is logged, and tried again."""
     while True:
-        await act()
+        try:
+            await act()
+        except Exception:  # whatever it was, a page that learns nothing more would look as ever
+            logging.getLogger("panel").exception("the panel goes on after")
         await asyncio.sleep(REVIEW_PERIOD)
 
 
@@ -249,8 +260,7 @@ def main() -> int:
     stop = stop_at_signals()
     loop = IOLoop.current()
     with connect(arguments.timeout, stop) as ros:
-        names = ["/" + name.strip("/") for name in arguments.finger]
-        bench = Bench(ros, names, arguments.control)
+        bench = Bench(ros, arguments.finger, arguments.control)
         try:
             server = serve(bench, arguments.host, arguments.port, loop)
         except (OSError, UnicodeError) as error:
@@ -307,6 +317,10 @@ def parse(words: list[str]) -> argparse.Namespace:
     arguments = parser.parse_args(words)
     if len(arguments.finger) > MOST_FINGERS:
         parser.error(f"{len(arguments.finger)} fingers are named, a page shows {MOST_FINGERS}")
+    try:
+        arguments.finger = [full_namespace(name) for name in arguments.finger]
+    except ValueError as error:
+        parser.error(str(error))
     return arguments
 
 

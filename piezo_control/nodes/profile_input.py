@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from rclpy.node import Node
 from std_msgs.msg import Header
 
 from piezo_control.nodes.qos import FOLLOWED, LATCHED, SETPOINT
@@ -17,6 +17,9 @@ from piezo_gripper_msgs.msg import Profile as ProfileMessage
 from piezo_gripper_msgs.msg import Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
 
+if TYPE_CHECKING:
+    from piezo_control.nodes.base import FingerNode
+
 
 def to_message(profile: Profile, max_force: float = 0.0) -> ProfileMessage:
     """Return the message that says `profile`, on the way of which a finger pushes with `max_force` (N) at most."""
@@ -26,6 +29,11 @@ def to_message(profile: Profile, max_force: float = 0.0) -> ProfileMessage:
         value=profile.value.tolist(),
         interpolation=ProfileMessage.LINEAR if profile.linear else ProfileMessage.HOLD,
     )
+
+
+def from_message(message: ProfileMessage) -> Profile:
+    """Return the profile that a message says; ValueError for one that says none."""
+    return Profile(message.time, message.value, message.interpolation == ProfileMessage.LINEAR)
 
 
 def waveform_message(waveform: Waveform) -> WaveformMessage:
@@ -44,7 +52,7 @@ class ProfileInput:
 
     def __init__(
         self,
-        node: Node,
+        node: FingerNode,
         topic: str,
         sample_time: float,
         largest: float,
@@ -111,12 +119,7 @@ class ProfileInput:
         self._take(self._topic, lambda: Profile([0.0], [sample.value]))
 
     def _on_profile(self, message: ProfileMessage) -> None:
-        linear = message.interpolation == ProfileMessage.LINEAR
-        self._take(
-            f"{self._topic}_profile",
-            lambda: Profile(message.time, message.value, linear),
-            message.max_force,
-        )
+        self._take(f"{self._topic}_profile", lambda: from_message(message), message.max_force)
 
     def _on_waveform(self, message: WaveformMessage) -> None:
         def make() -> Waveform:
@@ -142,7 +145,7 @@ class ProfileInput:
             if not 0.0 <= max_force <= LARGEST_FORCE:
                 raise ValueError(f"max_force is {max_force:g}, must be in [0, {LARGEST_FORCE:g}] N")
         except ValueError as error:
-            self._node.get_logger().error(f"'{topic}' ignored: {error}")
+            self._node.refuse(f"'{topic}' ignored: {error}")
             return
         self._sampled = SampledSignal(signal, self._sampled.sample_time)
         self.max_force = max_force or math.inf

@@ -4,7 +4,8 @@
 in:  reference (Sample, m: one value), reference_profile (Profile, m over s since sample 0),
      reference_waveform (Waveform, m), temperature (sensor_msgs/Temperature, °C) with `force_control`
 out: samples (SampleBlock: every sample), deflection (Sample, m), command (Sample, m), voltage (Sample, V): one
-     in a hundred or so, state (FingerState), push (Sample, N) with `force_control`: the force of an object
+     in a hundred or so, state (FingerState), reference_followed_profile (Profile, m), reference_followed_waveform
+     (Waveform, m), push (Sample, N) with `force_control`: the force of an object
 
 One compiled loop in a thread under the real-time scheduler, at the sample time of its controller; ROS
 runs beside it and can be late without the finger noticing. What the certificate of the controller does not
@@ -22,10 +23,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from std_msgs.msg import Header
 
-from piezo_control.feedback import FeedbackParameters, controller_file, successor
+from piezo_control.feedback import FeedbackParameters, controller_file, is_limited, successor
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
+from piezo_control.nodes.block import command_range
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
@@ -71,13 +74,16 @@ class ServoNode(FingerNode):
         self.states = self.create_publisher(FingerState, "state", LATCHED)
         self.thermometer = Thermometer(self.parameters.thermometer, time.monotonic())
         self._temperature_input: TemperatureInput | None = None
-        self.reference = ProfileInput(self, "reference", 1.0, LARGEST_DEFLECTION, self._refer)
+        self.reference = ProfileInput(
+            self, "reference", 1.0, LARGEST_DEFLECTION, self._refer, says=True
+        )
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
         )
         self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.phase = FingerState.IDLE
         self._last: Samples | None = None
+        self._held = 0  # samples whose command was at an end of its range
         self._told = 0.0
         self._errors: list[tuple[float, float]] = []
 
@@ -153,6 +159,7 @@ class ServoNode(FingerNode):
         self.reference.restart(controller.sample_time)
         self._refer()
         self._told = time.monotonic()
+        self._held = 0
         self._since = math.nan
         self._rates = [(self._told, 0)]
         self._errors.clear()
@@ -213,12 +220,13 @@ class ServoNode(FingerNode):
         figures: dict[str, Any] = {
             "controller": s.feedback.name,
             "certified": s.feedback.certified,
+            **command_range(s.feedback),
             "not covered": "; ".join(self._objections),
             "sample": s.number,
             "rate (Hz)": f"{self._rate():.1f}",
             "missed periods": s.missed,
             "samples not published": s.lost,
-            "clipped": s.clipped,
+            "clipped": s.clipped + self._held,
             "faults": s.faults,
         }
         for share in (0.5, 0.9, 0.99, 0.999):
@@ -234,6 +242,7 @@ class ServoNode(FingerNode):
     def _refer(self) -> None:
         if self.servo:
             self.servo.refer(self.reference.signal, self.reference.max_force)
+            self.reference.say(Header(stamp=base.system_time()))
 
     def _on_temperature(self, degc: float, _: float) -> None:
         self.thermometer.hear(degc, time.monotonic())
@@ -284,6 +293,9 @@ class ServoNode(FingerNode):
         for part in np.split(np.arange(len(samples)), ends):
             self.blocks.publish(self._block(samples, part))
         error = np.abs(samples.reference - samples.deflection)
+        by_controller = s.feedback.controller != "none" or self.parameters.force_control
+        held = is_limited(s.feedback, samples.command, samples.reference, by_controller)
+        self._held += int(np.count_nonzero(held))
         self._errors.append(
             (samples.instant[-1], float(np.max(error, where=error >= 0, initial=0)))
         )
@@ -344,15 +356,15 @@ class ServoNode(FingerNode):
             state.samples = max(0, s.number + 1)
             state.period = s.sample_time
             state.voltage = s.voltage
-            state.clipped = s.clipped
+            state.clipped = s.clipped + self._held
             state.overruns = s.missed
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
             state.text = s.cause or self._doubts(s)
+            state.reference = self.reference[state.samples]
             state.since = base.wall_time(self._since)
             state.times = s.faults
             if self._last:
-                state.reference = float(self._last.reference[-1])
                 state.deflection = float(self._last.deflection[-1])
             worst = max((error for _, error in self._errors), default=np.inf)
             state.on_target = bool(

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 Act = Callable[[], Any]
 STEPS = {"−1": -1.0, "−0.1": -0.1, "+0.1": 0.1, "+1": 1.0}
 """Of the set-point, in µm."""
+ANSWER_TIME = 0.5  # s in which a reference that was asked for is in force
 BOTH = "both"
 ENDING = ("sweep", "decaying_sine")
 """Shapes that need a duration."""
@@ -41,6 +43,11 @@ def number(text: str, what: str, unit: str) -> float:
     return value
 
 
+def text_of(um: float) -> str:
+    """Return a length (µm) to the picometre, as a field holds it."""
+    return f"{round(um, 6) + 0.0:.10g}"
+
+
 class Controls:
     """The widgets of a page, and what they ask of the bench.
 
@@ -49,6 +56,9 @@ class Controls:
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
+        self._references: dict[str, float] = {}  # µm, in force, of the fingers that tell theirs
+        self._shown = 0.0  # µm, in field and slider
+        self._asked = -math.inf  # s, when a set-point was asked for last
         self.widgets: list[Any] = []
         """With the names that the page has for them."""
         names = list(bench.fingers)
@@ -79,17 +89,50 @@ class Controls:
         self._button("zero", "Zero", partial(self._set, 0.0))
         self._button("home", "Home", lambda: self._each("home", lambda f: f.home()))
 
+    def follow(self) -> None:
+        """Let field and slider show the reference in force, unless somebody is at them."""
+        if time.monotonic() < self._asked + ANSWER_TIME:
+            return
+        told = {name: f.newest().reference * 1e6 for name, f in self._bench.fingers.items()}
+        self._references = {name: um for name, um in told.items() if math.isfinite(um)}
+        um = self._references.get(self._chosen()[0].namespace, self._shown)
+        if self._set_point.value_input == text_of(self._shown):
+            self._fill(um)
+        if self._slider.value == self._shown:
+            self._slider.value = um
+        self._shown = um
+
+    def _fill(self, um: float) -> None:
+        self._set_point.update(value=text_of(um), value_input=text_of(um))
+
+    def _typed(self) -> float:
+        return number(self._set_point.value_input, "the set-point", "µm")
+
     def _go(self) -> None:
-        self._set(number(self._set_point.value_input, "the set-point", "µm"))
+        self._set(self._typed())
 
     def _step(self, step: float) -> None:
-        self._set(number(self._set_point.value_input, "the set-point", "µm") + step)
+        """Go on from each finger's own reference; from the field where a finger has told none."""
+        names = [finger.namespace for finger in self._chosen()]
+        told = self._references
+        self._set_each(
+            {name: (told[name] if name in told else self._typed()) + step for name in names}
+        )
 
     def _set(self, um: float) -> None:
-        text = f"{um:.4g}"
-        self._set_point.update(value=text, value_input=text)
+        self._set_each({finger.namespace: um for finger in self._chosen()})
+
+    def _set_each(self, targets: Mapping[str, float]) -> None:
+        """Let fingers go to deflections (µm)."""
+        self._asked = time.monotonic()
+        self._references |= {name: um for name, um in targets.items() if name in self._references}
+        self._shown = um = next(iter(targets.values()))
+        self._fill(um)
         self._slider.value = um
-        self._each(f"set-point {um:g} µm", lambda finger: finger.set(um * 1e-6))
+        for name, um in targets.items():
+            self._bench.ask(
+                f"{name}: set-point {um:g} µm", partial(self._bench.fingers[name].set, um * 1e-6)
+            )
 
     # --- waveform ---------------------------------------------------------------------------------------
 

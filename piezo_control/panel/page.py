@@ -80,6 +80,8 @@ def build(document: Document, bench: Bench) -> None:
         document.add_root(root)
 
     def tell() -> None:
+        if controls:
+            controls.follow()
         cards.text = render("cards", cards=bench.cards())
         messages.text = render("messages", messages=bench.messages)
         wrong = bench.complaints()

@@ -6,7 +6,8 @@ in: ~/joint_commands (sensor_msgs/JointState): position in m, at most velocity i
 
 Commands come as `joint_state_topic_hardware_interface` of ros2_control sends them: again and again until the position
 is reached, with NaN as long as no controller has written one, and with the names of joints that have none. So a
-command that is repeated is the same command: it does not push anew against an object at which the gripper stopped.
+command that is repeated is the same command: it does not push anew against an object at which the gripper stopped. Nor does it
+fight whoever asked for something else in between: it is held back, which is said once, until a command differs.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from piezo_control.gripper import Waypoint
+from piezo_control.gripper import Goal, Waypoint
 from piezo_control.nodes.block import seconds
 from piezo_control.nodes.faces.asker import Asker
 from piezo_control.nodes.qos import SETPOINT
@@ -51,6 +52,8 @@ class JointCommands(Asker):
     def __init__(self, gripper: GripperNode) -> None:
         self._gripper = gripper
         self._last: tuple[float, float, float] | None = None
+        self._goal: Goal | None = None  # what became of it
+        self._says_so = False
         self._inputs = [
             gripper.create_subscription(JointState, "~/joint_commands", self._on_command, SETPOINT),
             gripper.create_subscription(
@@ -66,14 +69,28 @@ class JointCommands(Asker):
     def _on_command(self, message: JointState) -> None:
         try:
             command = wanted(message, self._gripper.parameters.joint)
-            if command == self._last or math.isnan(command[0]):
+            if math.isnan(command[0]):
+                return
+            if command == self._last:
+                self._hold_back(command[0])
                 return
             goal = self._gripper.check_goal(*command)
         except ValueError as error:
             self._ignored("~/joint_commands", error)
             return
-        self._last = command
+        self._last, self._goal, self._says_so = command, goal, False
         self._gripper.move(goal, self)
+
+    def _hold_back(self, opening: float) -> None:
+        """Say once that a repeated command does not bring the gripper back from where others sent it."""
+        if self._says_so or self._gripper.goal is self._goal:
+            return
+        self._says_so = True
+        name = self._gripper.resolve_topic_name("~/joint_commands")
+        self._gripper.get_logger().warning(
+            f"'{name}' repeats {opening * 1e6:g} µm, held back: the fingers were stopped or sent elsewhere since. "
+            "A command that differs moves them"
+        )
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
         joint = self._gripper.parameters.joint
