@@ -157,3 +157,21 @@ def test_unusable_recordings_are_refused(recordings):
     cold = Measurement("a.csv", time, time, time, None, None, np.arange(100))
     with pytest.raises(MeasurementError, match="a.csv: no column 'temperature'"):
         identify_drift([cold], HysteresisParameters())
+
+
+def test_recordings_that_leave_nothing_to_fit_are_refused_or_tell_nothing():
+    """A voltage that jumps all the time, a deflection that stays, a pulse that is no more than its jumps."""
+    time, rows = np.arange(300) * 1e-2, np.arange(300)
+    degc, jumping = np.full(300, 22.0), 20.0 * (rows % 2)
+    step = np.where(rows < 30, 0.0, 40.0)
+    for voltage, deflection in ((jumping, 1e-6 * jumping), (step, 1e-6 * (rows == 30))):
+        with pytest.raises(MeasurementError, match="must be at least 20, in which the deflection"):
+            identify_drift(
+                [Measurement("a.csv", time, voltage, deflection, degc, None, rows)],
+                HysteresisParameters(),
+            )
+    warm, pulse = np.where(rows < 100, 22.0, 32.0), np.where(rows == 40, 40.0, 0.0)
+    heated = Measurement("b.csv", time, pulse, 1e-7 * (warm - 22.0), warm, None, rows)
+    model = identify_drift([heated], HysteresisParameters((0.0,), (1e-6,)))
+    assert model.sensitivity == pytest.approx(1e-7, rel=0.01)
+    assert model.gain_per_degc == model.lag_per_degc == 0.0

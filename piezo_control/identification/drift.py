@@ -38,6 +38,7 @@ from piezo_control.thermal import REFERENCE_DEGC
 ROWS = 3000  # per recording, of block means: vibration and noise average out
 RELAXATIONS = 8  # from block to recording, two or so per decade
 JUMP = 0.1  # of the static range, from block to block: such blocks ring and are not fitted
+FEWEST_BLOCKS = 20
 SMALLEST_WARMING = 1.0  # degC, to tell what depends on temperature
 LEVELS = 10  # parts of a recording whose mean temperatures count: a thermocouple's noise does not
 
@@ -126,6 +127,14 @@ class _Means:
         # Where the first rise from rest ends is where the operator was identified from.
         self.kept[: -(-first // block)] = False
         self.is_loop = is_loop(measurement.voltage[first:])
+        seen = self.deflection[self.kept]
+        if seen.size < FEWEST_BLOCKS or np.ptp(seen) == 0.0:
+            moved = np.ptp(seen) if seen.size else 0.0
+            raise MeasurementError(
+                f"{measurement.source}: between the jumps of the voltage are {seen.size} blocks of {self.step:.3g} s, "
+                f"must be at least {FEWEST_BLOCKS}, in which the deflection moves by {moved:.3g} m: hold the voltage, "
+                "and record longer"
+            )
 
     def is_same_loop(self, other: _Means) -> bool:
         """Say whether both are loops under one voltage, at temperatures that differ."""
@@ -193,7 +202,7 @@ def identify_drift(
         )
 
     measured = rows(deflections)
-    scale = float(np.std(measured))
+    scale = float(np.std(measured)) or 1.0
 
     def regressors(time_constant: float, cold_share: float) -> list[NDArray]:
         blocks = []
@@ -238,12 +247,15 @@ def identify_drift(
     def values(numbers: NDArray) -> dict[str, Any]:
         (log, cold_share), amounts = numbers[:2], numbers[2 : 2 + RELAXATIONS]
         shift, growth, widening, static = numbers[2 + RELAXATIONS : 6 + RELAXATIONS].tolist()
+        inverse = (
+            1.0 / static if static else 0.0
+        )  # what does not answer a voltage has no stroke to change
         total = float(np.sum(amounts))
         per_degc = (
             total * (1.0 - float(cold_share)) / (warmest - coldest) if spans_temperatures else 0.0
         )
         shares = amounts / total if total > 0.0 else np.full(RELAXATIONS, 1.0 / RELAXATIONS)
-        gain_per_degc = growth / static if (warming and spans_temperatures) or twins else 0.0
+        gain_per_degc = growth * inverse if (warming and spans_temperatures) or twins else 0.0
         return {
             "creep_gain": total - per_degc * (warmest - REFERENCE_DEGC),
             "creep_gain_per_degc": per_degc,
@@ -252,7 +264,7 @@ def identify_drift(
             "time_constant": float(np.exp(log)) if warming else 0.0,
             "gain_per_degc": gain_per_degc,
             # The lag grows with the stroke, too, at the temperature at which it was seen.
-            "lag_per_degc": widening / static / (1.0 + gain_per_degc * (warmest - REFERENCE_DEGC))
+            "lag_per_degc": widening * inverse / (1.0 + gain_per_degc * (warmest - REFERENCE_DEGC))
             if twins
             else 0.0,
         }
