@@ -12,6 +12,7 @@ feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.y
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -19,41 +20,44 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rich.console import Console
-from rich.table import Table
+# Many small matrices: the threads of BLAS, started with numpy, would make a fit ten times slower.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from piezo_control.creep import CreepParameters
-from piezo_control.dynamics import DynamicsParameters, ModesParameters
-from piezo_control.feedback import FeedbackParameters
-from piezo_control.feedforward import FeedforwardParameters
-from piezo_control.files import write_json
-from piezo_control.hysteresis import HysteresisParameters, deflection_history
-from piezo_control.identification import checks, plots
-from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns
-from piezo_control.identification.confidence import Values, lines
-from piezo_control.identification.drift import SMALLEST_WARMING, identify_drift, is_loop
-from piezo_control.identification.dynamics import (
+import numpy as np  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.table import Table  # noqa: E402
+
+from piezo_control.creep import CreepParameters  # noqa: E402
+from piezo_control.dynamics import DynamicsParameters, ModesParameters  # noqa: E402
+from piezo_control.feedback import FeedbackParameters  # noqa: E402
+from piezo_control.feedforward import FeedforwardParameters  # noqa: E402
+from piezo_control.files import write_json  # noqa: E402
+from piezo_control.hysteresis import HysteresisParameters, deflection_history  # noqa: E402
+from piezo_control.identification import checks, plots  # noqa: E402
+from piezo_control.identification.columns import QUANTITIES, add_options, chosen_columns  # noqa: E402
+from piezo_control.identification.confidence import Values, lines  # noqa: E402
+from piezo_control.identification.drift import SMALLEST_WARMING, identify_drift, is_loop  # noqa: E402
+from piezo_control.identification.dynamics import (  # noqa: E402
     DynamicsModel,
     Static,
     identify_dynamics,
     need_vibration,
 )
-from piezo_control.identification.fit import FitQuality, need, noise, quality, straight
-from piezo_control.identification.hysteresis import (
+from piezo_control.identification.fit import FitQuality, need, noise, quality, straight  # noqa: E402
+from piezo_control.identification.hysteresis import (  # noqa: E402
     HysteresisModel,
     equal_thresholds,
     identify_hysteresis,
     settled,
 )
-from piezo_control.identification.measurement import (
+from piezo_control.identification.measurement import (  # noqa: E402
     Measurement,
     MeasurementError,
     is_bag,
     read_measurement,
 )
-from piezo_control.options import within
-from piezo_control.parameters import (
+from piezo_control.options import within  # noqa: E402
+from piezo_control.parameters import (  # noqa: E402
     ParameterError,
     build,
     declarations,
@@ -62,8 +66,8 @@ from piezo_control.parameters import (
     load,
     parameter,
 )
-from piezo_control.sensorless import SensorlessParameters
-from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters
+from piezo_control.sensorless import SensorlessParameters  # noqa: E402
+from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters  # noqa: E402
 
 GROUPS = {
     "hysteresis": HysteresisParameters,
