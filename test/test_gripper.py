@@ -34,7 +34,7 @@ from piezo_control.gripper import (
     opening_of,
     reach,
 )
-from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SETPOINT
 from piezo_control.parameters import ParameterError, build
 from piezo_gripper_msgs.action import Grip
 from piezo_gripper_msgs.msg import FingerState, Sample
@@ -215,7 +215,7 @@ class Bench:
                 FingerState, f"{side}/state", lambda s, k=side: self.states.update({k: s}), LATCHED
             )
             self.node.create_subscription(
-                ProfileMessage, f"{side}/reference_profile", self.references[side].append, LATCHED
+                ProfileMessage, f"{side}/reference_profile", self.references[side].append, FOLLOWED
             )
         self.client = ActionClient(self.node, Grip, "grip")
 
@@ -385,13 +385,14 @@ def test_motion_and_stop_begin_where_somebody_else_has_left_the_reference(bench,
     # The gripper has heard a state as new as that.
     number = bench.states["left"].samples
     bench.wait(lambda: bench.states["left"].samples > number + 1000)
+    bench.references["left"].clear()
     if asks == "grip":
         bench.moving(bench.send(36e-6, 0.0, SLOW))
     else:
         stop = bench.node.create_client(Trigger, "gripper/stop")
         bench.wait(stop.service_is_ready)
         bench.result_of(stop.call_async(Trigger.Request()))
-        bench.wait(lambda: bench.references["left"])
+    bench.wait(lambda: bench.references["left"])
     # Stopped, it is held no further ahead of its tip than it was.
     assert bench.references["left"][0].value[0] == pytest.approx(place, abs=0.2e-6)
 

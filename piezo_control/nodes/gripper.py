@@ -127,6 +127,7 @@ class Finger:
         self.reference: Profile | None = None
         self._under_way: Profile | None = None  # a reference that was sent, until a state shows it
         self._sent = -math.inf
+        self._before = math.nan  # m, the reference in the state when that was sent
         self.zero = 0.0  # m, the deflection at which the finger is at rest
         self.heard = monotonic()
         self._way: deque[tuple[float, float]] = deque()  # times (s) and deflections (m) of late
@@ -165,6 +166,7 @@ class Finger:
         """Give the finger this reference."""
         self.reference = Profile(reference.time, reference.value + self.zero, reference.linear)
         self._under_way, self._sent = self.reference, self.heard
+        self._before = self.state.reference
         self.extend()
 
     def extend(self) -> None:
@@ -274,7 +276,8 @@ class Finger:
             self._way.popleft()
         if self._under_way is not None and not math.isnan(state.reference):
             is_shown = abs(state.reference - float(self._under_way.at(self.time))) <= SAME
-            if is_shown or self.heard - self._sent > UNDER_WAY:
+            is_another = abs(state.reference - self._before) > SAME
+            if is_shown or is_another or self.heard - self._sent > UNDER_WAY:
                 self._under_way = None  # from here on the state knows better
         if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
             self.follow(hold(0.0))
