@@ -126,8 +126,8 @@ class Finger:
         self.state: Any = None  # FingerState; None before the first
         self.reference: Profile | None = None
         self._under_way: Profile | None = None  # a reference that was sent, until a state shows it
+        self._before: list[Profile] = []  # what the states show until it has arrived
         self._sent = -math.inf
-        self._before = math.nan  # m, the reference in the state when that was sent
         self.zero = 0.0  # m, the deflection at which the finger is at rest
         self.heard = monotonic()
         self._way: deque[tuple[float, float]] = deque()  # times (s) and deflections (m) of late
@@ -164,9 +164,11 @@ class Finger:
 
     def follow(self, reference: Profile) -> None:
         """Give the finger this reference."""
+        self._before = [self.reference] if self.reference else []
+        if math.isfinite(self.state.reference):
+            self._before.append(hold(self.state.reference))
         self.reference = Profile(reference.time, reference.value + self.zero, reference.linear)
         self._under_way, self._sent = self.reference, self.heard
-        self._before = self.state.reference
         self.extend()
 
     def extend(self) -> None:
@@ -259,6 +261,10 @@ class Finger:
         self._node.destroy_subscription(self._states)
         self._node.destroy_subscription(self._pushes)
 
+    def _shows(self, reference: Profile) -> bool:
+        """Say whether the state has this reference in force."""
+        return abs(self.state.reference - float(reference.at(self.time))) <= SAME
+
     def _feel(self, push: Sample) -> None:
         self.push = push.value
         self._felt = push.number
@@ -274,11 +280,10 @@ class Finger:
             self._way.append((self.time, state.deflection))
         while len(self._way) > 2 and self.time - self._way[1][0] >= VELOCITY_WINDOW:
             self._way.popleft()
-        if self._under_way is not None and not math.isnan(state.reference):
-            is_shown = abs(state.reference - float(self._under_way.at(self.time))) <= SAME
-            is_another = abs(state.reference - self._before) > SAME
-            if is_shown or is_another or self.heard - self._sent > UNDER_WAY:
-                self._under_way = None  # from here on the state knows better
+        if self._under_way is not None and math.isfinite(state.reference):
+            is_late = self.heard - self._sent > UNDER_WAY
+            if is_late or self._shows(self._under_way) or not any(map(self._shows, self._before)):
+                self._under_way = None  # it is there, or somebody else's: the state knows better
         if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
             self.follow(hold(0.0))
             self.reference = self._node.goal = None
