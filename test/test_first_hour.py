@@ -9,8 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TIMEOUT = 300.0  # s, for all lines of a page on a busy machine
-STAYS = ("cantilever ", "feedforward ", "feedback ", "finger ")  # until it is stopped
-RECORDER = "recorder --ros-args -p autostart:=false -r __ns:=/finger"
+STAYS = ("cantilever ", "feedforward ", "feedback ", "finger ", "recorder ")  # until it is stopped
 # Tested where they have what they need, a gripper or minutes: test_gripper_stack, test_package.
 ELSEWHERE = ("make ", "fingerctl grip ")
 
@@ -68,9 +67,7 @@ def test_readme_single_nodes(tmp_path):
 
 
 def test_fingerctl(tmp_path):
-    lines = typed("docs/fingerctl.md")
-    start = next(i for i, line in enumerate(lines) if line.startswith("finger "))
-    said = run([*lines[: start + 1], f"{RECORDER} &", *lines[start + 1 :]], tmp_path)
+    said = run(typed("docs/fingerctl.md"), tmp_path)
     assert "/finger: cantilever, feedback, feedforward" in said
     assert "/finger/feedback: inactive" in said
     assert (tmp_path / "bags" / "first" / "metadata.yaml").exists()
