@@ -21,7 +21,7 @@ def test_figures_of_the_linear_loop_are_those_that_its_certificate_says(linear):
 
     def certified(label):
         nominal, worst = re.search(
-            rf"# {re.escape(label)} +[\d.]+ +([\d.]+) +([\d.]+)", text
+            rf"# {re.escape(label)} +[≤<] [\d.]+ +([\d.]+) +([\d.]+)", text
         ).groups()
         return float(nominal), float(worst)
 

@@ -155,8 +155,9 @@ def test_nonsense_of_a_second_publisher_is_told_with_who_publishes(neighbour, tm
     with node("cantilever", tmp_path, reply_timeout=600.0):
         states = neighbour.listen(FingerState, "state", LATCHED)
         deflections = neighbour.listen(Sample, "deflection")
-        first, second = neighbour.publisher("voltage"), neighbour.publisher("voltage")
+        first = neighbour.publisher("voltage")
         neighbour.wait(lambda: deflections and states)
+        second = neighbour.node.create_publisher(Sample, "voltage", SAMPLE)
         neighbour.insist(second, sample(0, 1e6), lambda: states[-1].phase == FingerState.FAULT)
         assert "'/voltage' has 2 publishers: " in states[-1].text
         assert first
