@@ -326,14 +326,10 @@ def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[fl
     back to where it was homed; one whose range is the same on both sides arrives at the same ends from there.
     Beyond them the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
     """
-    plays = [0.0] * len(operator.weights)
-    ends = []
-    for voltage in (low, high, low, high):
-        for i, threshold in enumerate(operator.thresholds):
-            plays[i] = max(voltage - threshold, min(voltage + threshold, plays[i]))
-        hysteresis = sum(w * play for w, play in zip(operator.weights, plays, strict=True))
-        ends.append(dead_zones(operator, hysteresis))
-    return ends[2], ends[3]
+    state = State([0.0] * len(operator.weights), voltage=[0.0], voltage_step=[0.0])
+    # Each voltage twice: at rest, thresholds that depend on the rate are the plain ones.
+    ends = [operator_step(operator, state, voltage) for voltage in 2 * (low, low, high, high)]
+    return ends[5], ends[7]
 
 
 def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:

@@ -17,7 +17,7 @@ from rich.console import Console
 from piezo_control.nodes import fingerctl
 from piezo_control.nodes.client import LEAD_TIME, ClientError, connect
 from piezo_control.nodes.profile_input import waveform_message
-from piezo_control.nodes.qos import LATCHED, SETPOINT
+from piezo_control.nodes.qos import FOLLOWED, LATCHED, SETPOINT
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import WAVEFORM_TYPE, read
 from piezo_control.waveform import Waveform
@@ -194,6 +194,20 @@ def test_the_reference_is_the_one_that_is_followed_also_for_who_joins_later(ros,
     ros.node.destroy_publisher(waveforms)
     finger.zero()
     finger.wait_for(near(finger, 0.0))
+
+
+def test_nonsense_about_what_is_followed_does_not_end_a_client(ros, finger):
+    """A profile needs as many values as times; the reference stays that of the finger's state."""
+    finger.set(2e-6)
+    finger.wait_for(near(finger, 2e-6))
+    topic = "/finger/reference_followed_profile"
+    followed = ros.node.create_publisher(Profile, topic, FOLLOWED)
+    finger.wait_for(lambda: followed.get_subscription_count() > 0)
+    followed.publish(Profile(time=[0.0, 1.0], value=[9e-6]))
+    finger.set(3e-6)
+    finger.wait_for(near(finger, 3e-6))
+    assert finger.newest().reference == 3e-6
+    ros.node.destroy_publisher(followed)
 
 
 def test_what_a_finger_cannot_follow_is_refused_naming_its_reach(ros, control, capsys, finger):

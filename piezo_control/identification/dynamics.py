@@ -279,7 +279,7 @@ class _Problem:
         delay = fit.chain.delay
         fits = [
             self.refined(fit.chain._replace(delay=float(n)), moves_delay=False)
-            for n in (math.floor(delay), math.ceil(delay))
+            for n in sorted({math.floor(delay), math.ceil(delay)})
         ]
         best = min(fits, key=lambda fit: fit.squares)
         is_whole = abs(best.chain.delay - delay) < WHOLE

@@ -790,8 +790,14 @@ class Finger:
         self.ros.lifecycle(recorder, "cleanup")
 
     def _on_followed(self, read: Callable[[Any], Signal], message: Any) -> None:
+        try:
+            signal = read(message)
+        except ValueError as error:
+            logger = self.ros.node.get_logger()
+            logger.error(f"'{self.prefix}reference_followed' ignored: {error}")
+            return
         stamp = seconds(message.header.stamp)
-        self._followed.append(Followed(time.monotonic(), stamp, read(message)))
+        self._followed.append(Followed(time.monotonic(), stamp, signal))
 
     def _on_state(self, state: FingerState) -> None:
         self._heard = time.monotonic()

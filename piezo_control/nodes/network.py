@@ -8,6 +8,7 @@ nodes of other machines for ever.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -29,5 +30,9 @@ class Networks:
 
     @staticmethod
     def _up() -> set[str]:
-        states = Path("/sys/class/net").glob("*/operstate")
-        return {state.parent.name for state in states if state.read_text().strip() == "up"}
+        found = set()
+        for state in Path("/sys/class/net").glob("*/operstate"):
+            with contextlib.suppress(OSError):  # of an interface that goes while it is looked at
+                if state.read_text().strip() == "up":
+                    found.add(state.parent.name)
+        return found
