@@ -21,6 +21,7 @@ from mcap.reader import make_reader
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
 from piezo_control.feedback import Feedback, FeedbackParameters
@@ -30,7 +31,7 @@ from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import read
 from piezo_control.touch import Touch, TouchParameters
-from piezo_gripper_msgs.msg import FingerState, Profile, RecorderState, Sample
+from piezo_gripper_msgs.msg import FingerState, Profile, RecorderState, Sample, SampleSeries
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
@@ -61,6 +62,10 @@ class Neighbour:
         timer = self.node.create_timer(0.05, lambda: publisher.publish(message))
         self.wait(done)
         self.node.destroy_timer(timer)
+
+    def send(self, publisher, message, done):
+        publisher.publish(message)
+        self.wait(done)
 
     def listen(self, kind, topic, qos=SAMPLE):
         heard = []
@@ -451,6 +456,69 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
     assert read(bag, run=0).number.tolist() == [0, 1, 2, 5]
     assert read(bag, run=1).deflection.tolist() == [-1e-6] * 3
     assert (bag / "metadata.yaml").exists()
+
+
+def test_series_are_recorded_as_the_samples_they_are_of(neighbour, tmp_path):
+    """Every field of the messages that a subscriber of the single samples hears is in the bag."""
+    bag = tmp_path / "bag"
+    limits = {"command_low": -2e-6, "command_high": 2e-6}
+    with (
+        node("recorder", tmp_path, bag=bag) as recorder,
+        node("feedback", tmp_path, "feedback_paper.yaml", subscribers=2, **limits),
+    ):
+        heard = neighbour.listen(Sample, "command")
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        reference = neighbour.publisher("reference", SETPOINT)
+        deflection = neighbour.publisher("deflection")
+        reference.publish(sample(0, 10e-6))
+        neighbour.insist(deflection, sample(0, 0.0), lambda: heard)
+        for number in range(1, 250):
+            deflection.publish(sample(number, 1e-8 * number))
+        neighbour.wait(lambda: heard[-1].number == 249 and states)
+        row = states[-1].topics.index("command")
+        neighbour.wait(lambda: states[-1].recorded[row] == 250)
+        assert states[-1].missing[row] == 0
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    kept = open_bag(bag).topics["/command"]
+    once = {command.number: serialize_message(command) for command in heard}
+    assert kept.data == [once[number] for number in range(250)]
+    assert any(command.limited for command in heard) and heard[0].by_controller
+
+
+def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbour, tmp_path):
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        publishers = {
+            name: neighbour.node.create_publisher(SampleSeries, f"{name}_series", SAMPLE)
+            for name in ("deflection", "command")
+        }
+        recorded = 0
+        for name, first, value in (
+            ("deflection", range(1), 1.0), ("command", range(1), 2.0),  # again until they are heard
+            ("deflection", range(1, 10), 1.0), ("command", range(1, 6), 2.0),
+            ("deflection", range(4), 3.0), ("command", range(6, 10), 2.0), ("command", range(4), 4.0),
+        ):  # fmt: skip
+            series = SampleSeries(number=first[0], period=1e-4, value=[value] * len(first))
+            series.header.stamp.nanosec = first[0] * 100_000
+            series.later = [i * 100_000 for i in range(len(first))]
+            series.flags = [0] * len(first)
+            recorded += len(first)
+            send = neighbour.insist if first == range(1) else neighbour.send
+            send(
+                publishers[name],
+                series,
+                lambda n=recorded: states and sum(states[-1].recorded) == n,
+            )
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    for run, count, values in ((0, 10, (1.0, 2.0)), (1, 4, (3.0, 4.0))):
+        got = read(bag, run=run)
+        assert got.number.tolist() == list(range(count))
+        assert (got.deflection.tolist(), got.command.tolist()) == (
+            [values[0]] * count, [values[1]] * count,
+        )  # fmt: skip
 
 
 def test_signals_that_come_while_a_node_ends_change_nothing(neighbour, tmp_path):

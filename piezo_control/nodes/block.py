@@ -22,6 +22,7 @@ from piezo_control.feedback import FeedbackParameters
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, NEWEST, SAMPLE
+from piezo_control.nodes.sample_output import SampleOutput
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.safety import Guard, is_physical
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
@@ -77,7 +78,7 @@ class BlockNode(FingerNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.answers = self.create_publisher(Sample, self.OUTPUT, SAMPLE)
+        self.answers = SampleOutput(self, self.OUTPUT)
         self.faults = self.create_publisher(Fault, "fault", FAULTS)
         self.last = Sample()
         self.sequence = Sequence()
@@ -200,10 +201,10 @@ class BlockNode(FingerNode):
                     throttle_duration_sec=1.0,
                 )
                 return
-            readers = self.answers.get_subscription_count()
+            readers = self.answers.readers()
             if readers < self.parameters.subscribers:
                 self.say(
-                    f"waits for {self.parameters.subscribers} subscribers of '{self.answers.topic_name}': "
+                    f"waits for {self.parameters.subscribers} subscribers of '{self.answers.name}': "
                     f"{readers} are there"
                 )
                 return  # the cantilever asks again

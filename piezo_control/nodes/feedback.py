@@ -41,7 +41,7 @@ from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode, command_range
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
-from piezo_control.nodes.qos import LATCHED, SAMPLE
+from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, flatten
 from piezo_control.profile import SampledSignal
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
@@ -171,6 +171,7 @@ class FeedbackNode(BlockNode):
             self.destroy_subscription(self._expectations)
             self.destroy_publisher(self._pushes)
             self._expectations = self._pushes = None
+        self.answers.finish(DELIVERY_TIMEOUT)
 
     def apply(self) -> None:
         if not self._take_file():

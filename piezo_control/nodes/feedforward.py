@@ -268,7 +268,7 @@ class FeedforwardNode(BlockNode):
             self._ramp()
             time.sleep(RAMP_PERIOD)
         # The program may end right after this; what was sent last is what the finger is left at.
-        self.answers.wait_for_all_acked(DELIVERY_TIMEOUT)
+        self.answers.finish(DELIVERY_TIMEOUT)
         self.guard.reset()
 
     def _watch(self) -> None:

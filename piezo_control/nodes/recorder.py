@@ -8,7 +8,8 @@ A recording begins at activation and is finished, readable, at deactivation, shu
 SIGTERM. Numbered samples are written once each, whatever the transport repeats; numbers never seen are
 counted as missing. A message's time in the bag is its own stamp, so a lock-step run replays at the
 finger's speed; one without a stamp, as of `ros2 topic pub`, has that of the newest sample. A run that starts
-again at sample 0 goes on in the same bag, behind the one before.
+again at sample 0 goes on in the same bag, behind the one before. Samples that their node sends in series as well
+(:mod:`piezo_control.nodes.sample_output`) are taken from these, which leaves the loop its time.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from piezo_control.nodes import base as finger_node
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import RecorderParameters
 from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE
+from piezo_control.nodes.sample_output import nanoseconds, series_of
 from piezo_control.recording.recording import (
     BLOCK_TYPE,
     PROFILE_TYPE,
@@ -36,9 +38,9 @@ from piezo_control.recording.recording import (
     TEMPERATURE_TYPE,
     WAVEFORM_TYPE,
 )
-from piezo_control.recording.writer import BagWriter
-from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
-from piezo_gripper_msgs.msg import RecorderState
+from piezo_control.recording.writer import BagWriter, sample_data
+from piezo_control.sequence import REPEATED, STRAY, Sequence
+from piezo_gripper_msgs.msg import RecorderState, Sample, SampleSeries
 
 FINGER = {
     "reference": (SAMPLE_TYPE, SAMPLE),
@@ -61,6 +63,9 @@ FINGER = {
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
 STATE_PERIOD = 0.05  # s
 FLUSH_PERIOD = 0.5  # s
+PAUSE = (
+    10**9
+)  # ns in the bag between two runs: what is on its way of the first comes before the second
 
 
 class Track:
@@ -69,14 +74,21 @@ class Track:
     def __init__(self, topic: str, connection: Connection, has_header: bool) -> None:
         self.connection = connection
         self.has_header = has_header
-        self.is_numbered = connection.msgtype == SAMPLE_TYPE and topic not in SET_POINTS
+        self.is_numbered = is_numbered(topic, connection.msgtype)
         self.is_block = connection.msgtype == BLOCK_TYPE
         self.is_stamped = connection.msgtype == TEMPERATURE_TYPE
         self.sequence = Sequence(gaps=True)
+        self.run = 0
+        self.begin = 0  # ns in the bag, of that run
         self.last_stamp = -1
         self.recorded = 0
         self.duplicates = 0
         self.missing = 0
+
+
+def is_numbered(topic: str, kind: str) -> bool:
+    """Say whether a topic with messages of type `kind` brings numbered samples."""
+    return kind == SAMPLE_TYPE and topic not in SET_POINTS
 
 
 def sample_number(data: bytes) -> int:
@@ -96,7 +108,11 @@ class RecorderNode(FingerNode):
         self.create_steady_timer(FLUSH_PERIOD, self._flush)
         self.trouble = ""
         self.writer: BagWriter | None = None
+        self.types: dict[str, tuple[str, QoSProfile]] = {}
         self.inputs: list[Any] = []
+        self.single_samples: dict[
+            str, Any
+        ] = {}  # subscriptions, of topics that do not come in series
         self.latched: dict[str, bytes] = {}
         self.tracks: dict[str, Track] = {}
 
@@ -109,18 +125,41 @@ class RecorderNode(FingerNode):
             return TransitionCallbackReturn.FAILURE
         self.types = types
         for topic, (name, qos) in types.items():
+            if is_numbered(topic, name):
+                series = series_of(self.resolve_topic_name(topic))
+                take = partial(self._write_series, topic)
+                self.inputs.append(self.create_subscription(SampleSeries, series, take, SAMPLE))
+                continue
             package, _, kind = name.split("/")
             message = getattr(importlib.import_module(f"{package}.msg"), kind)
             latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
             write = partial(self._keep if latched else self._write, topic)
             self.inputs.append(self.create_subscription(message, topic, write, qos, raw=True))
+        self._look_for_single_samples()
         return super().on_configure(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         while self.inputs:
             self.destroy_subscription(self.inputs.pop())
+        while self.single_samples:
+            self.destroy_subscription(self.single_samples.popitem()[1])
+        self.types = {}
         self.latched.clear()
         return super().on_cleanup(state)
+
+    def _look_for_single_samples(self) -> None:
+        """Hear sample by sample whom sends no series: a driver or a controller of somebody's own."""
+        for topic, (name, qos) in self.types.items():
+            if not is_numbered(topic, name):
+                continue
+            where = self.resolve_topic_name(topic)
+            is_needed = self.count_publishers(where) > self.count_publishers(series_of(where))
+            if is_needed and topic not in self.single_samples:
+                self.single_samples[topic] = self.create_subscription(
+                    Sample, topic, partial(self._write, topic), qos, raw=True
+                )
+            elif not is_needed and topic in self.single_samples:
+                self.destroy_subscription(self.single_samples.pop(topic))
 
     def start(self) -> None:
         whose = self.get_namespace().strip("/").replace("/", "_") or "finger"
@@ -129,7 +168,8 @@ class RecorderNode(FingerNode):
         self.tracks = {}
         self.newest = 0
         self.has_blocks = False
-        self.begin = 0
+        self.begin = 0  # ns in the bag, of the newest run
+        self.run = 0
         self.unstamped: list[tuple[str, bytes]] = []
         for topic, (name, qos) in self.types.items():
             if name not in writer.typestore.types:
@@ -192,7 +232,9 @@ class RecorderNode(FingerNode):
             stamp = seconds * 10**9 + nanoseconds
             if track.is_numbered and not self._is_new(track, sample_number(data), stamp):
                 return
-            if stamp or track.is_numbered or track.is_block or track.is_stamped:
+            if track.is_numbered:
+                stamp += track.begin
+            elif stamp or track.is_block or track.is_stamped:
                 stamp += self.begin
             if track.is_numbered or track.is_block:
                 self._tell_time(max(stamp, self.newest, 1))
@@ -208,13 +250,36 @@ class RecorderNode(FingerNode):
             return
         if track.is_stamped:
             track.last_stamp = stamp
+        self._put(track, stamp, data)
+        self.has_blocks |= track.is_block
+
+    def _write_series(self, topic: str, series: SampleSeries) -> None:
+        """Write the samples of a series as if they had come one by one."""
+        track = self.tracks.get(topic)
+        first = nanoseconds(series)
+        for i, (later, value, flags) in enumerate(zip(series.later, series.value, series.flags)):
+            if self.writer is None or track is None:
+                return
+            number, stamp = series.number + i, first + later
+            if self._is_new(track, number, stamp):
+                data = sample_data(
+                    stamp, number, value, series.period,
+                    bool(flags & SampleSeries.LIMITED),
+                    bool(flags & SampleSeries.BY_CONTROLLER),
+                    bool(flags & SampleSeries.WITHOUT_TEMPERATURE),
+                )  # fmt: skip
+                self._tell_time(max(stamp + track.begin, self.newest, 1))
+                self._put(track, stamp + track.begin, data)
+
+    def _put(self, track: Track, stamp: int, data: bytes) -> None:
+        """Write a message at `stamp` (ns in the bag)."""
+        assert self.writer is not None
         try:
             self.writer.write(track.connection, stamp, data)
         except OSError as error:
             self._give_up(self.writer, error)
             return
         track.recorded += 1
-        self.has_blocks |= track.is_block
 
     def _tell_time(self, newest: int) -> None:
         """Take note of the time (ns) of the newest sample; what waited for one is written."""
@@ -224,6 +289,7 @@ class RecorderNode(FingerNode):
 
     def _is_new(self, track: Track, number: int, stamp: int) -> bool:
         """Count sample `number` of a topic and say whether it has not been written yet."""
+        self._follow_run(track, number, stamp)
         kind = track.sequence.classify(number)
         if kind == STRAY and number >= track.sequence.next:
             self.get_logger().error(
@@ -234,16 +300,31 @@ class RecorderNode(FingerNode):
         if kind in (REPEATED, STRAY):
             track.duplicates += 1
             return False
-        if kind == FIRST and track.sequence.next > 0:
-            for other in self.tracks.values():
-                other.sequence = Sequence(gaps=True)
-                other.last_stamp = -1
-            # In simulated time the new run begins at 0 again; in the bag it comes after the one before.
-            self.begin = self.newest if stamp < self.newest else 0
         if not self.has_blocks:  # beside blocks, single samples are a selection
             track.missing += number - max(track.sequence.next, 0)
         track.sequence.count(number)
         return True
+
+    def _follow_run(self, track: Track, number: int, stamp: int) -> None:
+        """Begin a new run with a sample 0, and with the numbers that go back of the topics that are behind.
+
+        The end of the run before may still be on its way, with numbers that go on.
+        """
+        if track.run == self.run:
+            if (
+                number > 0 or track.sequence.next <= 1
+            ):  # no sample 0, or the one that has come already
+                return
+            # In simulated time the new run begins at 0 again; in the bag it comes after the one before.
+            self.begin = self.newest + PAUSE if stamp <= self.newest else 0
+            self.run += 1
+            self.leader = track
+            for other in self.tracks.values():
+                other.last_stamp = -1
+        elif 0 <= track.sequence.next <= number or number >= self.leader.sequence.next:
+            return
+        track.sequence = Sequence(gaps=True)
+        track.run, track.begin = self.run, self.begin
 
     def report(self) -> tuple[str, dict[str, Any]]:
         return self.trouble, {topic: track.recorded for topic, track in self.tracks.items()}
@@ -266,6 +347,7 @@ class RecorderNode(FingerNode):
         self.publish_diagnostics()
 
     def _publish_state(self) -> None:
+        self._look_for_single_samples()
         tracks = self.tracks
         state = RecorderState(topics=list(tracks))
         state.header.stamp = self.get_clock().now().to_msg()

@@ -36,6 +36,21 @@ SAMPLE_CDR = struct.Struct("<4s i I I 4x Q d d ? ? ?")
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
+def sample_data(
+    stamp: int,
+    number: int,
+    value: float,
+    period: float,
+    limited: bool = False,
+    by_controller: bool = False,
+    without_temperature: bool = False,
+) -> bytes:
+    """Return a serialized Sample with its time `stamp` in ns."""
+    flags = limited, by_controller, without_temperature
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    return SAMPLE_CDR.pack(LITTLE_ENDIAN, seconds, nanoseconds, 1, number, value, period, *flags)
+
+
 class BagWriter:
     """A rosbag2 folder being written; it is readable after :meth:`close`.
 
@@ -144,18 +159,7 @@ def write_recording(
         if k in changes:
             bag.write(warmth, stamp, _temperature(bag, stamp, recording.temperature[k]))
         for topic, values, limited in signals:
-            data = SAMPLE_CDR.pack(
-                LITTLE_ENDIAN,
-                *divmod(stamp, 10**9),
-                1,
-                number,
-                values[k],
-                period,
-                limited[k],
-                False,
-                False,
-            )
-            bag.write(topic, stamp, data)
+            bag.write(topic, stamp, sample_data(stamp, number, values[k], period, limited[k]))
     bag.close()
 
 

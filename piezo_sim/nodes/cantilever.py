@@ -29,7 +29,8 @@ from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.block import stray, too_old, wrong_time
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
-from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE
+from piezo_control.nodes.qos import DELIVERY_TIMEOUT, FAULTS, LATCHED, SAMPLE
+from piezo_control.nodes.sample_output import SampleOutput
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
@@ -62,8 +63,8 @@ class CantileverNode(FingerNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.deflections = self.create_publisher(Sample, "deflection", SAMPLE)
-        self.contact_forces = self.create_publisher(Sample, "contact_force", SAMPLE)
+        self.deflections = SampleOutput(self, "deflection")
+        self.contact_forces = SampleOutput(self, "contact_force")
         self.clocks = self.create_publisher(Clock, "clock", SAMPLE)
         self.states = self.create_publisher(FingerState, "state", LATCHED)
         self.voltages = SoleInput(self, "voltage", self._on_voltage, SAMPLE, self._look_around)
@@ -133,6 +134,7 @@ class CantileverNode(FingerNode):
         else:
             self._end(FingerState.IDLE)
         self.guard.reset()
+        self.deflections.finish(DELIVERY_TIMEOUT)
 
     def apply(self) -> None:
         self.guard.hold_time = self.parameters.hold_time
@@ -212,7 +214,7 @@ class CantileverNode(FingerNode):
 
     def _ask(self) -> None:
         """Publish clock and deflection, once more where that was done, if they have their readers."""
-        if self.deflections.get_subscription_count() >= self.parameters.subscribers:
+        if self.deflections.readers() >= self.parameters.subscribers:
             self.clocks.publish(Clock(clock=self.sample.header.stamp))
             self.deflections.publish(self.sample)
 
