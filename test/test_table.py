@@ -462,7 +462,7 @@ def test_a_clock_in_milliseconds_since_1970_is_not_taken_for_seconds(tmp_path):
     path = write_table(tmp_path / "a.csv", time=lambda k: f"{1795687200000 + 100 * k}")
     assert read_measurement(path, {"time": "0:ms"}).sample_time == pytest.approx(0.1)
     path = write_table(path, ["time", *HEADINGS[1:]], lambda k: f"{1795687200000 + 100 * k}")
-    with pytest.raises(MeasurementError, match="may be milliseconds since 1970: .*--time 0:ms"):
+    with pytest.raises(MeasurementError, match="may be ms, us or ns since 1970: .*--time 0:ms"):
         read_measurement(path)
 
 
@@ -475,6 +475,12 @@ def test_what_is_below_the_data_is_left_out_and_said(tmp_path):
     assert (
         len(found.time) == 60 and "4 rows of words or of a summary at the end" in found.description
     )
+    words = [
+        "words,time,voltage,deflection_um\n",
+        *(f"max,{0.1 * k:.1f},{k % 7},{k}\n" for k in range(60)),
+    ]
+    path.write_text("".join(words))
+    assert len(read_measurement(path).time) == 60
     path.write_text(data + "Mean,3,59\n6.0,1,2\n")
     with pytest.raises(MeasurementError, match="row 62 is 'Mean', must be a finite number"):
         read_measurement(path)

@@ -196,7 +196,7 @@ def layout(rows: list[Row]) -> Layout:
         at = -1
     below = [row for row in rows[at + 1 :] if not row.comment]
     end = len(below)
-    while end and _follows(below[end - 1], width):
+    while end and not fits(below[end - 1]) and _follows(below[end - 1], width):
         end -= 1
     summary = len(below) - end
     del below[end:]

@@ -39,7 +39,7 @@ OVERFLOW = (
 )  # 9.9e37 is IEEE 488.2's for a value beyond the range, 1e37 older instruments'
 DOUBTFUL = {
     "temperature": (150.0, 500.0, "kelvin", "K"),
-    "time": (1e11, 1e14, "milliseconds since 1970", "ms"),
+    "time": (1e11, 1e19, "ms, us or ns since 1970", "ms"),
 }
 """Between which a column that has no unit may be in another: no piezo is as warm, and 1e11 s are 3000 years."""
 GUESSED = "m", "mm", "um", "nm"  # picometres are always said
