@@ -25,7 +25,7 @@ def correlated(random, kept, deviation, size=TIME.size):
 def test_the_interval_holds_the_truth_in_19_of_20_measurements(kept):
     """300 of them, so that 0.95 is seen to ± 0.025; for a memory of 19 samples, white intervals hold a mean in 0.35.
 
-    Also of what only the beginning tells: there, few blocks alone would hold the truth in 0.1 to 0.7.
+    Also of what only the beginning tells: there, blocks alone would hold the truth in 0.8 and 0.6.
     """
     matrix = np.column_stack(
         (np.sin(2.0 * np.pi * TIME), np.exp(-TIME / 0.3), np.ones_like(TIME), TIME)

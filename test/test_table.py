@@ -23,6 +23,7 @@ COLUMNS = {
     "labview.lvm": {"time": "X_Value"},
     "oscilloscope_head.csv": {"voltage": "CH1", "deflection": "CH2:um"},
     "oscilloscope_units.csv": {"voltage": "A", "deflection": "B"},
+    "oscilloscope_increment.csv": {"time": "X", "voltage": "CH1", "deflection": "CH2:um"},
     "polytec.txt": {"deflection": "Displacement"},
     "attocube.csv": {"voltage": "U", "deflection": "Axis 1"},
     "oscilloscope_numbers.csv": {"time": "x-axis", "voltage": "1", "deflection": "2:um"},

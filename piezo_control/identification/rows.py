@@ -170,6 +170,7 @@ def layout(rows: list[Row]) -> Layout:
     row of words above the first row that looks like these, or in a comment right above it. Raises ValueError for a
     row with more cells than columns, and for names that are not as many.
     """
+    rows = _timed(rows)
     shown = [row.cells for row in rows if not row.comment][-JUDGED:]
     width = Counter(map(len, shown)).most_common(1)[0][0]
     shown = [cells for cells in shown if len(cells) == width]
@@ -224,6 +225,22 @@ def layout(rows: list[Row]) -> Layout:
     _refuse_thousands(whole, decimal)
     above = sum(not row.comment for row in rows[: max(at, 0)])
     return Layout(names, units, whole, decimal, above, summary)
+
+
+def _timed(rows: list[Row]) -> list[Row]:
+    """Return rows with the time in the place of Rigol's numbers of samples: it has 'Start' and 'Increment' above."""
+    names, below = (row.cells for row in rows[:2]) if len(rows) > 1 else ([], [])
+    if names[:1] != ["X"] or "Increment" not in names or len(below) < len(names) - 1:
+        return rows
+    last = names.index("Increment") - 1
+    try:
+        start, increment = map(float, below[last : last + 2])
+        times = [repr(start + increment * float(row.cells[0])) for row in rows[2:]]
+    except ValueError:
+        return rows
+    head = [rows[0]._replace(cells=names[:last]), rows[1]._replace(cells=["s", *below[1:last]])]
+    data = [row._replace(cells=[t, *row.cells[1:last]]) for row, t in zip(rows[2:], times)]
+    return head + data
 
 
 def _follows(row: Row, width: int) -> bool:
