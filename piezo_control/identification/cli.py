@@ -501,7 +501,7 @@ def said(name: str, source: str, found: Values, confidence: Values) -> str:
     """Return what a file says of an identification: its source, and how well each value is known."""
     texts = [
         source,
-        "95 % intervals by the linearised model for correlated residuals, without errors of the model itself:",
+        "95 % intervals, by what the model leaves of these recordings; what it cannot describe elsewhere is not in them:",
         *lines(found, confidence),
     ]
     return "\n".join(f"{name}: {text}" for text in texts)
