@@ -61,7 +61,7 @@ class HysteresisModel:
     lag: float  # s, by which the sensor shows a deflection late
     smoothness: float  # penalty chosen
     confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
-    untold: str = ""  # why there is no virgin share
+    untold: str = "only a classical operator has one"  # why there is no virgin share
 
     def deflection(self, time: ArrayLike, voltage: ArrayLike) -> NDArray[np.float64]:
         """Return what the sensor shows (m) under a voltage history (V) from rest."""
@@ -309,41 +309,41 @@ class _Problem:
         return model if len(self.knots) else self._first_rise(model, at_start, drift)
 
     def _first_rise(self, model: HysteresisModel, at_start: float, drift: float) -> HysteresisModel:
-        """Add the virgin share, told by the rows until the voltage has been to both ends."""
+        """Add the virgin share, as told by the rows until the voltage has been to both ends."""
         measurement = self.measurement
         rows = slice(0, settled(measurement))
         time, voltage = measurement.time[rows], measurement.voltage[rows]
-        shown = np.interp(time + model.lag, measurement.time, measurement.deflection)
-        shown -= at_start + drift * np.log1p(time - measurement.time[0])
         straight, bent = (
             deflection_history(replace(model.parameters, virgin_share=share), voltage)
             for share in (0.0, 1.0)
         )
-        bend = bent - straight
-        near = np.abs(voltage) <= 2.0 * REST * self.half_range
-        if not (near.any() and near[0]):
-            return replace(model, untold="the recording does not begin at rest, 0 V")
-        start = near[: np.argmin(near)] if not near.all() else near
-        moved = float(np.mean((shown - straight)[: len(start)]))
-        if abs(moved) > REST * self.stroke:
-            return replace(
-                model,
-                untold=f"the recording begins {moved * 1e6:.3g} µm beside the rest of its later loops",
+        bend = (bent - straight) / self.stroke
+        shown = np.interp(time + model.lag, measurement.time, measurement.deflection) - straight
+        shown -= at_start + drift * np.log1p(time - measurement.time[0])
+        start = int(np.argmin(np.abs(voltage) <= 2.0 * REST * self.half_range))
+        if not start:
+            return replace(model, untold="the recording does not begin at 0 V")
+        beside = float(np.mean(shown[:start]))
+        if abs(beside) > REST * self.stroke:
+            untold = (
+                f"the recording begins {beside * 1e6:.3g} µm beside the rest of its later loops"
             )
-        square = float(bend @ bend)
-        share = min(1.0, max(0.0, float(bend @ (shown - straight)) / square)) if square else 0.0
-        found = intervals(
+            return replace(model, untold=untold)
+        shown /= self.stroke
+        square = float(bend @ bend) or 1.0  # one play alone has no bend
+        share = min(1.0, max(0.0, float(bend @ shown) / square))
+        width = intervals(
             lambda number: {"hysteresis.virgin_share": float(number[0])},
             np.array([share]),
-            bend[:, None] / self.stroke,
-            (shown - straight - share * bend) / self.stroke,
+            bend[:, None],
+            shown - share * bend,
         )
-        if not share > found["hysteresis.virgin_share"]:
+        if not np.all(share > np.array(width["hysteresis.virgin_share"])):
             return replace(model, untold="it is not told from 0")
         return replace(
             model,
             parameters=replace(model.parameters, virgin_share=share),
-            confidence={**model.confidence, **found},
+            confidence={**model.confidence, **width},
         )
 
     def _confidence(
