@@ -46,9 +46,7 @@ LAG_ROWS = 4000  # rows used while searching the lag
 LAG_PLAYS = 60  # and so many thresholds, of more every second, third, ...
 LAG_SMOOTHNESS = (3e-4, 0.01, 0.3, 10.0)
 LAG_GAIN = 0.02  # relative, of the deviation: a lag that gains less is not believed
-REST = (
-    0.02  # of the stroke, or of the range of the voltage: so near to it a recording begins at rest
-)
+REST = 0.02  # of the stroke and of the voltage's range: so near to rest a recording begins
 MOST_ROWS = 200_000  # rows used in a fit; of longer measurements every second, third, ...
 
 
@@ -325,10 +323,8 @@ class _Problem:
             return replace(model, untold="the recording does not begin at 0 V")
         beside = float(np.mean(shown[:start]))
         if abs(beside) > REST * self.stroke:
-            untold = (
-                f"the recording begins {beside * 1e6:.3g} µm beside the rest of its later loops"
-            )
-            return replace(model, untold=untold)
+            place = f"{beside * 1e6:.3g} µm beside the rest of its later loops"
+            return replace(model, untold=f"the recording begins {place}")
         shown /= self.stroke
         square = float(bend @ bend) or 1.0  # one play alone has no bend
         share = min(1.0, max(0.0, float(bend @ shown) / square))
