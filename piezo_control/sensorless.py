@@ -53,7 +53,8 @@ from piezo_control.hysteresis import (
     Coefficients,
     HysteresisParameters,
     State,
-    coefficients,
+    at_rest,
+    from_rest,
     operator_inverse,
     operator_step,
 )
@@ -143,8 +144,7 @@ def sensorless_coefficients(
             "'hysteresis' has dead zones or rate-dependent thresholds: the sensorless inverse is for the "
             "classical operator, `identify hysteresis` without them"
         )
-    operator = coefficients(h, sample_time)
-    slopes = list(accumulate(operator.weights))
+    slopes = list(accumulate(h.weights))
     for degc in (p.temperature_low, p.temperature_high):
         # Between the two the slopes of the inverse are on straight lines but for a positive factor.
         warmth = degc - REFERENCE_DEGC
@@ -157,7 +157,7 @@ def sensorless_coefficients(
             )
     times, shares = np.array(p.creep.times), np.array(p.creep.shares)
     return SensorlessCoefficients(
-        operator=operator,
+        operator=from_rest(h, sample_time),
         creep=creep.discretize(p.creep.gain, p.creep.gain_per_degc, times, shares, sample_time),
         thermal=thermal.discretize(p.thermal, slopes[-1], sample_time),
         taps=list(shaping.shaper(p.shaping, p.dynamics.denominator, sample_time)),
@@ -174,7 +174,7 @@ def sensorless_coefficients(
 def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> SensorlessState:
     """Return the state of a homed finger at its rest voltage, in equilibrium with `temperature_degc`."""
     start = min(max(temperature_degc, c.coldest), c.warmest)
-    hysteresis = State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0])
+    hysteresis = at_rest(c.operator)
     home = operator_step(c.operator, hysteresis, c.rest)
     return SensorlessState(
         hysteresis=hysteresis,

@@ -157,6 +157,8 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
         f"smoothness {model.smoothness:g}"
     )
+    share = model.parameters.virgin_share
+    console.print(f"virgin share {share:.3g}" if share else f"virgin share 0: {model.untold}")
 
     feedforward = FeedforwardParameters(
         static_gain=float(np.ptp(measurement.deflection[first:]) / np.ptp(measurement.voltage)),
