@@ -396,7 +396,7 @@ def test_unusable_cases_are_refused_before_anything_runs(monkeypatch, tmp_path, 
     for words, message in (
         (
             ("--controller", "unheard_of"),
-            "not one of the known fast, integrator_notch, paper, pid, robust, robust_delay_2",
+            "not one of the known fast, following, following_adapted, integrator_notch, paper, pid, robust",
         ),
         (("--amplitude-v", 20.0), "--amplitude-v has no effect on any run"),
         (("--amplitude-um", 0.0), "amplitude is 0, and 'step' needs a finger that moves"),

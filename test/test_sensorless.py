@@ -222,12 +222,31 @@ def led_by_a_controller():
     return law
 
 
-def test_a_controller_is_led_through_the_inverse_hysteresis():
-    law = led_by_a_controller()
+@pytest.mark.parametrize("degc", [12.0, 22.0, 32.0])
+def test_a_controller_meets_the_same_finger_at_any_temperature(degc):
+    """What the voltage does to H_s(U, theta), by thermal.py's equation, is the command."""
+    p = SensorlessParameters()
+    law = Sensorless(p, H, degc)
+    operator, warmth = Hysteresis(p.hysteresis, H), degc - 22.0
+    for k in range(1000):
+        command = 15e-6 * math.sin(k / 200.0)
+        voltage = law.lead(command, degc)
+        cold = operator.step(voltage)
+        lag = sum(p.hysteresis.weights) * voltage - cold
+        warm = (1.0 + p.thermal.gain_per_degc * warmth) * (
+            cold - p.thermal.lag_per_degc * warmth * lag
+        )
+        assert warm == pytest.approx(command, abs=1e-15)
+
+
+def test_a_controller_meets_a_finger_of_the_nominal_gain_once_that_is_adapted():
+    law = Sensorless(SensorlessParameters(), H, 22.0)
+    law.state.adapted.gain[0] = 1.05
     inverse = Feedforward(FeedforwardParameters(), H)
     for k in range(1000):
-        voltage = inverse.step(15e-6 * math.sin(k / 200.0))
-    assert law.voltage == pytest.approx(voltage, abs=1e-11)
+        command = 15e-6 * math.sin(k / 200.0)
+        voltage = inverse.step(command / 1.05)
+        assert law.lead(command, 22.0) == pytest.approx(voltage, abs=1e-9)
 
 
 def test_the_sensor_is_taken_away_in_mid_run_and_given_back_without_a_bump():
