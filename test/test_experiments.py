@@ -20,6 +20,7 @@ from rosbags.highlevel import AnyReader
 
 from piezo_control.parameters import ParameterError, dump
 from piezo_control.recording.recording import BagError, read
+from piezo_control.report.page import print_table
 from piezo_control.shared import version
 from piezo_control.start import ENDING
 from piezo_sim.experiment import cli, paper, results, study
@@ -32,7 +33,6 @@ from piezo_sim.experiment.cases import (
     read_experiment,
 )
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import print_table
 
 LONGEST = {"creep": 6.0, "thermal": 0.9}  # s, of the shorter runs
 H = 1e-4

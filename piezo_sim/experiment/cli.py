@@ -20,11 +20,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from piezo_control.identification.columns import LOOP, add_options, chosen_columns
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
+from piezo_control.report.page import Section, print_table, write_html
 from piezo_control.start import interrupt_at_signals
 from piezo_sim.experiment.analysis import ANALYSES
 from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, not_covered, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import Section, print_table, write_html
 from piezo_sim.experiment.study import results_folder
 
 EXPERIMENTS = {

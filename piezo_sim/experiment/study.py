@@ -17,8 +17,8 @@ from rich.console import Console
 from piezo_control.files import write_json
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
+from piezo_control.report.page import Section, print_table, write_html
 from piezo_sim.experiment.cases import RunFailed
-from piezo_sim.experiment.report import Section, print_table, write_html
 
 Work = Callable[[argparse.Namespace, Path, Console], tuple[dict[str, Any], Sequence[Section]]]
 """Does a study into a folder; returns what metrics.json and the report shall hold."""
