@@ -40,6 +40,7 @@ from piezo_control.hysteresis import (  # noqa: E402
     coefficients,
     reachable_range,
 )
+from piezo_control.options import output_file, output_folder  # noqa: E402
 from piezo_control.parameters import (  # noqa: E402
     ParameterError,
     T,
@@ -308,10 +309,12 @@ def parse() -> argparse.Namespace:
         "problem", type=Path, help="design problem, e.g. params/synthesis_robust.yaml"
     )
     parser.add_argument(
-        "--out", type=Path, help="controller to write (feedback_<name>.yaml in this folder)"
+        "--out", type=output_file, help="controller to write (feedback_<name>.yaml in this folder)"
     )
     parser.add_argument(
-        "--report", type=Path, help="folder of certificate and pictures (out/synthesize/<name>)"
+        "--report",
+        type=output_folder,
+        help="folder of certificate and pictures (out/synthesize/<name>)",
     )
     parser.add_argument(
         "--cantilever",

@@ -56,7 +56,7 @@ from piezo_control.identification.measurement import (  # noqa: E402
     is_bag,
     read_measurement,
 )
-from piezo_control.options import within  # noqa: E402
+from piezo_control.options import output_folder, within  # noqa: E402
 from piezo_control.parameters import (  # noqa: E402
     ParameterError,
     build,
@@ -612,7 +612,11 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
         help="age of a deflection (1)",
     )
     reading.add_argument(
-        "--out", "-o", type=Path, default=Path("out/identified"), help="folder (out/identified)"
+        "--out",
+        "-o",
+        type=output_folder,
+        default="out/identified",
+        help="folder (out/identified)",
     )
     for name, default, text in (
         ("--start", 0.0, "use from here on"),
