@@ -182,6 +182,13 @@ def test_where_nothing_can_be_written_is_refused_before_anything_is_done(
     assert sorted(os.listdir()) == files
 
 
+def test_a_commissioning_that_nobody_answers_ends_with_a_line(files, monkeypatch):
+    monkeypatch.setattr(commission, "commission", lambda bench, console, agree: agree("step?"))
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    code, said, _ = run(commission.main, ["--driver=simulated"])
+    assert (code, said) == (1, "commission: nobody is there to answer; --yes asks nothing\n")
+
+
 def test_a_working_directory_that_is_gone_is_said(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tmp_path.rmdir()

@@ -373,6 +373,9 @@ def main() -> int:
     except (NoAnswer, MeasurementError, SynthesisError) as error:
         print(f"commission: {error}", file=sys.stderr)
         return 1
+    except EOFError:
+        print("commission: nobody is there to answer; --yes asks nothing", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("commission: ended by a signal; the voltage is led to rest", file=sys.stderr)
         return 1
