@@ -182,6 +182,16 @@ def test_where_nothing_can_be_written_is_refused_before_anything_is_done(
     assert sorted(os.listdir()) == files
 
 
+def test_letters_that_a_terminal_does_not_have_end_nothing(monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), "ascii", write_through=True)
+    say = types.SimpleNamespace(main=lambda: print("5 µm"))
+    monkeypatch.setattr(start.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(importlib, "import_module", lambda name: say)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    start.executable("a")()
+    assert terminal.buffer.getvalue() == b"5 ?m\n"
+
+
 def test_a_commissioning_that_nobody_answers_ends_with_a_line(files, monkeypatch):
     monkeypatch.setattr(commission, "commission", lambda bench, console, agree: agree("step?"))
     monkeypatch.setattr(sys, "stdin", io.StringIO())

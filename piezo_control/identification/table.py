@@ -320,7 +320,9 @@ def read_table(path: str | Path, wanted: Mapping[str, str | None] = MappingProxy
         return _read_sheet(path)
     try:
         rows, form = read_rows(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise TableError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
         raise TableError(f"{path}: cannot be read as text: {error}") from None
     return _table(path, rows, form)
 
