@@ -6,8 +6,11 @@ from __future__ import annotations
 import atexit
 import importlib
 import signal
+import sys
 import time
 from collections.abc import Callable
+from io import TextIOWrapper
+from pathlib import Path
 from typing import Any
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
@@ -71,12 +74,22 @@ def stop_at_signals() -> Stop:
 
 
 def executable(module: str) -> Callable[[], int]:
-    """Return a function that imports `module` and runs its `main`."""
+    """Return a function that imports `module` and runs its `main`.
+
+    What the machine refuses, such as a full disk, is said in a line, with exit code 1; letters that the terminal does
+    not have, such as µ, stand there as '?'.
+    """
 
     def start() -> int:
         # Nothing moves a finger yet; what does sets handlers of its own that bring it to rest.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        return importlib.import_module(module).main()
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")
+        try:
+            return importlib.import_module(module).main()
+        except OSError as error:
+            print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+            return 1
 
     return start
 

@@ -386,8 +386,10 @@ def read_table(path: str | Path, wanted: Mapping[str, str | None] = MappingProxy
     try:
         data = path.read_bytes()
         rows, form = read_rows(gzip.decompress(data) if path.suffix.lower() == ".gz" else data)
-    except (OSError, ValueError, EOFError, zlib.error) as error:
+    except (gzip.BadGzipFile, ValueError, EOFError, zlib.error) as error:
         raise TableError(f"{path}: cannot be read as text: {error}") from None
+    except OSError as error:
+        raise TableError(f"{path}: cannot be read: {error.strerror}") from None
     return _table(path, rows, form)
 
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from piezo_control.metrics import bandwidth
+from piezo_control.report.page import Section
 from piezo_sim.experiment.analysis import frequency_response
-from piezo_sim.experiment.report import Section
 from piezo_sim.experiment.results import Result
 
 Values = list[float]

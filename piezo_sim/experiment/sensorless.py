@@ -29,6 +29,7 @@ from piezo_control.nodes.parameters import FeedforwardNodeParameters
 from piezo_control.parameters import build, dump, flatten, load
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording, read
+from piezo_control.report.page import Section
 from piezo_control.sensorless import SensorlessParameters
 from piezo_control.shaping import ShapingParameters, ahead, shaper
 from piezo_control.thermal import ThermalParameters
@@ -37,7 +38,6 @@ from piezo_sim.experiment import study as command_line
 from piezo_sim.experiment.cases import Case, RunFailed, read_experiment
 from piezo_sim.experiment.cli import run_all
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import Section
 from piezo_sim.plant.sensor import SensorParameters
 
 PLANTS = ("prandtl_ishlinskii", "truth")
