@@ -138,8 +138,8 @@ class Bench:
     """Nodes that were told to end, or to be inactive."""
     foreign: set[str] = field(default_factory=set)
     """Topics on which somebody else published."""
-    missing: list[str] = field(default_factory=list)
-    """Words that the logs must have; kept while one kind of event alone was at work."""
+    missing: list[tuple[str, ...]] = field(default_factory=list)
+    """Words, of each entry of which the logs must have one; kept while one kind of event alone was at work."""
     violations: list[str] = field(default_factory=list)
     samples: int = 0
     number: int = -1

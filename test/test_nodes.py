@@ -27,6 +27,7 @@ from sensor_msgs.msg import Temperature
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE, SETPOINT
+from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import read
@@ -56,6 +57,13 @@ class Neighbour:
         while not done():
             assert time.monotonic() < end, "nothing came"
             self.executor.spin_once(timeout_sec=0.02)
+
+    @staticmethod
+    def wait_idle(done):
+        """Wait for what the middleware does by itself, with a node that looks at nothing meanwhile."""
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            assert time.monotonic() < end, "nothing came"
 
     def insist(self, publisher, message, done):
         """Publish again and again until `done()`, as what is sent before the endpoints match is lost."""
@@ -456,6 +464,21 @@ def test_recorder_closes_its_bag_on_a_signal(neighbour, tmp_path, stop):
     assert read(bag, run=0).number.tolist() == [0, 1, 2, 5]
     assert read(bag, run=1).deflection.tolist() == [-1e-6] * 3
     assert (bag / "metadata.yaml").exists()
+
+
+def test_a_publisher_that_is_gone_before_a_busy_node_looks_around_is_told(neighbour, capfd):
+    node, changes = neighbour.node, []
+    SoleInput(node, "voltage", lambda _: None, SAMPLE, lambda: changes.append(1))
+    node.create_publisher(Sample, "voltage", SAMPLE)
+    neighbour.wait(lambda: changes)
+    second = node.create_publisher(Sample, "voltage", SAMPLE)
+    neighbour.wait_idle(lambda: second.get_subscription_count() > 0)
+    node.destroy_publisher(second)
+    neighbour.wait_idle(lambda: node.count_publishers("voltage") == 1)
+    neighbour.wait(lambda: len(changes) > 1)
+    assert (
+        "publishers of '/voltage' came and went, it has now 1: /neighbour" in capfd.readouterr().err
+    )
 
 
 def test_series_are_recorded_as_the_samples_they_are_of(neighbour, tmp_path):

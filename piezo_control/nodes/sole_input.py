@@ -71,6 +71,11 @@ class SoleInput:
         )
 
     def _on_matched(self, matched: Any) -> None:
+        if matched.total_count_change > max(0, matched.current_count - self._count):
+            # One that is gone before a busy node looks around is in no list any more, what it sent is here.
+            self._node.get_logger().warning(
+                f"publishers of '{self._topic}' came and went, it has now {matched.current_count}: {self._names()}"
+            )
         self._count = matched.current_count
         self._on_change()
 
