@@ -279,6 +279,10 @@ def test_a_card_that_does_not_say_where_it_is_has_to_be_at_rest():
     card = Card(says=False)
     assert math.isnan(applied(card, 1.0, 0.0))
     assert servo_on(card, stack).voltage == 75.0
+    # A library that lacks the optional function of piezo_driver.h.
+    udp = SharedLibrary("udp", "127.0.0.1:9", SLOW)
+    assert math.isnan(applied(udp, 1.0, 0.0))
+    udp.close()
 
 
 @pytest.mark.parametrize("said", [math.inf, 1001.0])
