@@ -216,7 +216,7 @@ class UdpFinger:
             lowest_voltage=float(seen.lowest[0]),
             highest_voltage=float(seen.highest[0]),
             largest_step=float(seen.step[0]),
-            last_voltage=float(self._device.demand[0]),
+            last_voltage=float(self._device.written[0]),
             own_ramps=int(seen.ramps[0]),
             refused_datagrams=int(seen.refused[0]),
         )
