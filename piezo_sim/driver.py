@@ -115,5 +115,9 @@ class Simulation:
         """Return nothing: this device does not fail."""
         return ""
 
+    def applied(self) -> float:
+        """Return the voltage (V) that is held."""
+        return float(self.device.written[0])
+
     def close(self) -> None:
         """Nothing to let go of."""

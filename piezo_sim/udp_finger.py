@@ -2,7 +2,9 @@
 """A finger at the other end of the servo's `udp` driver: a simulated piezocantilever in real time.
 
 Every datagram brings a voltage, which is held from then on, and is answered with the deflection measured just
-before. Without a voltage for the hold time the finger ramps itself to 0 V, as the hardware of a real one must.
+before. Without a voltage for the hold time the finger ramps itself to rest, as the hardware of a real one must.
+Whoever sends the first one leads the finger until it lets go or is silent for the hold time, and its numbers rise;
+others are named, told so and not acted upon.
 When it is stopped it says, and with --report writes, what voltages it saw.
 """
 
@@ -54,6 +56,8 @@ class Line(NamedTuple):
     floats: np.ndarray
     address: np.ndarray
     length: np.ndarray
+    leader: np.ndarray  # address of the one who leads the finger, 0: nobody
+    stray: np.ndarray  # of the last one who was refused
 
 
 class Seen(NamedTuple):
@@ -66,6 +70,7 @@ class Seen(NamedTuple):
     step: np.ndarray  # largest change from one voltage to the next
     number: np.ndarray
     ramps: np.ndarray  # how often nothing came for the hold time
+    refused: np.ndarray  # datagrams of others, and of numbers that do not rise
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,7 @@ class Report:
     largest_step: float
     last_voltage: float
     own_ramps: int
+    refused_datagrams: int
 
 
 def serve(
@@ -97,19 +103,32 @@ def serve(
         read(device, instant)
         if size == SIZE and line.integers[0] == WORD:
             voltage = line.floats[2]
+            number = line.integers[1]
+            sender = line.address[0]  # family, port and address
+            if number == 0:
+                if sender == line.leader[0]:
+                    line.leader[0] = 0
+                continue
+            if line.leader[0] == 0 or instant - heard > hold:
+                line.leader[0] = sender
+                seen.number[0] = min(seen.number[0], number - 1)
+            if sender != line.leader[0] or number <= seen.number[0]:
+                seen.refused[0] += 1.0
+                if sender != line.leader[0]:
+                    line.stray[0] = sender
+                    line.integers[1] = 0
+                    answer(line)
+                continue
             if seen.samples[0] > 0.0:
-                seen.lost[0] += max(line.integers[1] - seen.number[0] - 1, 0)
+                seen.lost[0] += number - seen.number[0] - 1
                 seen.step[0] = max(seen.step[0], abs(voltage - device.demand[0]))
             heard = instant
-            seen.number[0] = line.integers[1]
+            seen.number[0] = number
             seen.samples[0] += 1.0
             seen.lowest[0] = min(seen.lowest[0], voltage)
             seen.highest[0] = max(seen.highest[0], voltage)
             line.floats[2] = line.zero + line.scale * device.reading[0]
-            _sendto(
-                line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data,
-                line.length[0],
-            )  # fmt: skip
+            answer(line)
         elif instant - heard > hold and device.demand[0] != rest:
             if heard > 0:
                 seen.ramps[0] += 1.0
@@ -118,6 +137,13 @@ def serve(
         else:
             continue
         write(device, voltage, instant)
+
+
+def answer(line: Line) -> None:
+    """Send the datagram to whom the last one came from."""
+    _sendto(
+        line.socket, line.integers.ctypes.data, SIZE, 0, line.address.ctypes.data, line.length[0]
+    )  # fmt: skip
 
 
 class UdpFinger:
@@ -148,7 +174,7 @@ class UdpFinger:
         datagram = np.zeros(3, dtype=np.int64)
         self._line = Line(
             self._socket.fileno(), scale, zero, datagram, datagram.view(float), np.zeros(16, dtype=np.int64),
-            np.zeros(1, dtype=np.uint32),
+            np.zeros(1, dtype=np.uint32), np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64),
         )  # fmt: skip
         self._device = device_of(plant)
         self._seen = Seen(*(np.zeros(1) for _ in Seen._fields))
@@ -170,6 +196,13 @@ class UdpFinger:
         become_real_time(self._priority, -1)
         compiled(serve)(*self._arguments)
 
+    @property
+    def stray(self) -> str:
+        """Who was refused last, because somebody else leads the finger; empty: nobody."""
+        raw = self._line.stray.tobytes()
+        _, port = struct.unpack(">HH", raw[:4])
+        return f"{socket.inet_ntoa(raw[4:])}:{port}" if any(raw) else ""
+
     def stop(self) -> Report:
         """Answer no more; return what was seen."""
         self._stop[0] = 1
@@ -182,8 +215,9 @@ class UdpFinger:
             lowest_voltage=float(seen.lowest[0]),
             highest_voltage=float(seen.highest[0]),
             largest_step=float(seen.step[0]),
-            last_voltage=float(self._device.demand[0]),
+            last_voltage=float(self._device.written[0]),
             own_ramps=int(seen.ramps[0]),
+            refused_datagrams=int(seen.refused[0]),
         )
 
 
@@ -232,8 +266,11 @@ def main() -> int:
         print(f"udp_finger: {error}", file=sys.stderr)
         return 2
     print(f"udp_finger: answers at {arguments.host}:{finger.port}", flush=True)
+    told = ""
     while not stop.wait(1.0):
-        pass
+        if finger.stray != told:
+            told = finger.stray
+            print(f"udp_finger: {told} is refused: somebody else leads this finger", flush=True)
     report = asdict(finger.stop())
     print(json.dumps(report))
     if arguments.report:

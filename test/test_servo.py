@@ -157,7 +157,9 @@ def test_a_late_reading_is_bridged_and_a_silent_sensor_ends_at_rest(running):
     "more, cause",
     [
         ({"status": FAILED}, "the device failed"),
-        ({"age": 0.02}, "readings are 0.02 s old, must be at most 0.01 s"),
+        ({"age": 0.02}, "readings are 0.02 s old, must be within [0, 0.01] s"),
+        ({"age": math.nan}, "readings are nan s old, must be within"),
+        ({"age": -5.0}, "readings are -5 s old, must be within"),
         ({"raw": 41e-6}, r"the sensor says 41 µm, must be within [-40, 40] µm"),
         ({"raw": math.nan}, "the sensor says nan µm"),
         ({"raw": 1.7e308}, "the sensor says"),
@@ -415,7 +417,7 @@ def test_a_signal_in_the_midst_of_commissioning_ends_at_rest(monkeypatch):
 
     monkeypatch.setattr(commission, "Servo", Seen)
     arguments = argparse.Namespace(
-        sample_time=H, write="immediately", amplifier_gain=1.0, driver="simulated", driver_options="",
+        sample_time=H, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, driver="simulated", driver_options="",
         priority=0,
     )  # fmt: skip
     bench = commission.Bench(arguments, VoltageParameters(), 1.0)

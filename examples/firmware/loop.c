@@ -19,7 +19,7 @@ static atomic_int wants_reset;
 void loop_begin(void)
 {
     finger_init(&finger);
-    dac_write(finger.voltage / FINGER_AMPLIFIER_GAIN);
+    dac_write(FINGER_AMPLIFIER_ZERO + finger.voltage / FINGER_AMPLIFIER_GAIN);
 }
 
 void loop_refer(float metres)
@@ -42,6 +42,6 @@ void timer_interrupt(void)
         finger_reset(&finger);
     if (emergency_stop())
         finger_stop(&finger);
-    dac_write(finger_step(&finger, status, volts, reference) / FINGER_AMPLIFIER_GAIN);
+    dac_write(FINGER_AMPLIFIER_ZERO + finger_step(&finger, status, volts, reference) / FINGER_AMPLIFIER_GAIN);
     watchdog_kick();
 }

@@ -84,6 +84,7 @@ def firmware(
         "delay": feedback.delay_samples,
         "write": "as soon as the voltage is there" if servo.write == "immediately" else "at the next edge",
         "amplifier_gain": servo.amplifier_gain,
+        "amplifier_zero": servo.amplifier_zero,
         "largest_deflection": safety.LARGEST_DEFLECTION,
         "settings": settings,
         "limits": settings.voltage,

@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -147,7 +148,12 @@ class FingerNode(LifecycleNode):
 
     def comes_from(self, what: str, path: str | Path) -> None:
         """Say where the values of a file come from, here and on `/diagnostics`, if it says it; empty: of no file."""
-        words = "; ".join(provenance(path)) if path else ""
+        try:
+            words = "; ".join(provenance(path)) if path else ""
+        except (
+            ParameterError
+        ) as error:  # it has been read, and is gone since: nothing that a node ends for
+            words = str(error)
         if words and self._origins.get(what) != words:
             self.get_logger().info(f"{what} {path}: {words}")
         self._origins[what] = words
@@ -178,7 +184,7 @@ class FingerNode(LifecycleNode):
         """Begin to work with `self.parameters`; a ValueError raised here refuses the activation."""
 
     def stop(self) -> None:
-        """Leave the finger safe; called once when activity ends for whatever reason."""
+        """Leave the finger safe, when activity ends for whatever reason, or `start` has failed half-way."""
 
     def apply(self) -> None:
         """Take up changed `self.parameters` while active."""
@@ -189,7 +195,10 @@ class FingerNode(LifecycleNode):
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         try:
-            self.start()
+            with ExitStack() as half:
+                half.callback(self.stop)  # what has begun when it fails
+                self.start()
+                half.pop_all()
         except ValueError as error:
             self.refuse(f"not activated: {error}")
             return TransitionCallbackReturn.FAILURE

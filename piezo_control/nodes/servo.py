@@ -83,6 +83,7 @@ class ServoNode(FingerNode):
         self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.phase = FingerState.IDLE
         self._last: Samples | None = None
+        self._voltage, self._left = 0.0, ""  # of the loop before: V, and why that is not at rest
         self._held = 0  # samples whose command was at an end of its range
         self._told = 0.0
         self._errors: list[tuple[float, float]] = []
@@ -132,6 +133,10 @@ class ServoNode(FingerNode):
             )
 
     def start(self) -> None:
+        if self.servo:
+            raise ParameterError(
+                f"the loop of before still has the card: {self._wrong(self.servo)}"
+            )
         p = self.parameters
         controller = self._controller(p)
         check_delay(controller, p)
@@ -148,9 +153,10 @@ class ServoNode(FingerNode):
             self.servo = Servo(
                 driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling
             )
-        except ParameterError:
+        except (ParameterError, DriverError) as error:
             driver.close()
-            raise
+            raise ValueError(str(error)) from None
+        self._say_where_it_begins(self.servo.begins_at, feedforward.rest)
         if p.force_control:
             self.thermometer = Thermometer(p.thermometer, time.monotonic())
             self._temperature_input = TemperatureInput(self, self._on_temperature)
@@ -164,6 +170,7 @@ class ServoNode(FingerNode):
         self._rates = [(self._told, 0)]
         self._errors.clear()
         self._complained = False
+        self._say_origins()
         self.get_logger().info("the loop is compiled, if it was not before: half a minute or so")
         self.servo.start()
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
@@ -176,7 +183,14 @@ class ServoNode(FingerNode):
             f"'{controller.name}'"
         )
         self._follow_phase()
-        self._say_origins()
+
+    def _say_where_it_begins(self, voltage: float, rest: float) -> None:
+        if math.isnan(voltage):
+            self.get_logger().info(
+                f"the driver does not say what the card puts out: it has to be at rest, {rest:g} V"
+            )
+        elif voltage != rest:
+            self.get_logger().info(f"the card puts out {voltage:g} V: led to rest, {rest:g} V")
 
     def _say_origins(self) -> None:
         p = self.parameters
@@ -191,12 +205,21 @@ class ServoNode(FingerNode):
             self._temperature_input.close()
             self._temperature_input = None
             self.destroy_publisher(self.singles.pop("push"))
-        if self.servo:
-            self.servo.stop()
-            self._publish_samples()
-            self.servo = None
         self.phase = FingerState.IDLE
+        self._let_go()
         self._publish_state()
+
+    def _let_go(self) -> None:
+        """End the loop; say where its voltage is if that is not at rest."""
+        if not self.servo:
+            return
+        self._left = self.servo.stop()
+        if self._left:
+            self.get_logger().error(self._left)
+        self._publish_samples()
+        self._voltage = self.servo.voltage
+        if not self.servo.is_running:
+            self.servo = None
 
     def apply(self) -> None:
         """Let the controller of a changed `controller_file` take over."""
@@ -215,7 +238,7 @@ class ServoNode(FingerNode):
     def report(self) -> tuple[str, dict[str, Any]]:
         s = self.servo
         if s is None:
-            return "", {}
+            return self._left, {}
         lateness = s.lateness
         figures: dict[str, Any] = {
             "controller": s.feedback.name,
@@ -233,11 +256,12 @@ class ServoNode(FingerNode):
             figures[f"late, {share:.1%} (us)"] = f"{lateness_quantile(lateness, share) * 1e6:.0f}"
         if self.parameters.force_control:
             figures |= {"push": s.push, "temperature": self.thermometer.degc}
-        return s.cause or self._doubts(s), figures
+        return self._wrong(s), figures
 
-    def _doubts(self, servo: Servo) -> str:
-        """Return what is not as it should be, and ends nothing."""
-        return servo.complaint or (self.thermometer.wrong if self._temperature_input else "")
+    def _wrong(self, servo: Servo) -> str:
+        """Return what is not as it should be, the gravest of it."""
+        missing = self.thermometer.wrong if self._temperature_input else ""
+        return servo.stuck or servo.cause or servo.complaint or missing
 
     def _refer(self) -> None:
         if self.servo:
@@ -327,7 +351,11 @@ class ServoNode(FingerNode):
         """Say in `state` and the log what the loop's guard does."""
         s = self.servo
         assert s is not None
-        phase = PHASE_OF[s.phase]
+        # While the driver does not come back the loop's own phase is that of before.
+        stuck = s.stuck
+        phase = FingerState.HOLDING if stuck else PHASE_OF[s.phase]
+        if phase == FingerState.RAMPING and not s.cause:
+            phase = FingerState.WAITING  # until the card, which was elsewhere, is at rest
         if phase == self.phase:
             return
         before, self.phase = self.phase, phase
@@ -335,7 +363,10 @@ class ServoNode(FingerNode):
             self._since = math.nan
         elif math.isnan(self._since):
             self._since = time.monotonic()
-        if phase in LATCHED_PHASES and before not in LATCHED_PHASES:
+        if stuck:
+            self.get_logger().error(stuck)
+            self.publish_diagnostics()
+        elif phase in LATCHED_PHASES and before not in LATCHED_PHASES:
             self.get_logger().error(
                 f"{s.cause}; voltage goes to rest and stays there; {self.way_on()}"
             )
@@ -346,7 +377,15 @@ class ServoNode(FingerNode):
 
     def _publish_state(self) -> None:
         # What no thermometer and no model of a contact says is not known.
+        if (
+            self.servo
+            and not self.active
+            and self.phase == FingerState.IDLE
+            and not self.servo.is_running
+        ):
+            self._let_go()  # its driver has come back
         state = FingerState(phase=self.phase, temperature=self.thermometer.degc, tip_force=math.nan)
+        state.voltage, state.text = self._voltage, self._left
         state.header.stamp = base.system_time()
         if s := self.servo:
             if self.parameters.force_control:
@@ -360,7 +399,7 @@ class ServoNode(FingerNode):
             state.overruns = s.missed
             state.rate = self._rate()
             state.jitter = lateness_quantile(s.lateness, 0.999)
-            state.text = s.cause or self._doubts(s)
+            state.text = self._wrong(s)
             state.reference = self.reference[state.samples]
             state.since = base.wall_time(self._since)
             state.times = s.faults

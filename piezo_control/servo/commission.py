@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """From an unknown card and finger to a directory that `servo` starts with, step by step.
 
-1. at rest (`--rest-voltage`): the sensor's zero and noise;
+1. to rest (`--rest-voltage`), from where the card is: the sensor's zero and noise;
 2. a small step of the voltage: sign and gain of the sensor;
 3. a small sweep: delay in samples, resonance, damping;
 4. a decaying sine over the whole range: the hysteresis;
 5. the design: a controller for what was found, certified.
 
-Each step uses more voltage than the one before and asks first. The loop of the servo itself moves the finger,
+Each step, also that to rest, asks first, and uses more voltage than the one before. The loop of the servo itself moves the finger,
 with its limits of voltage and slew; a silent or saturated sensor ends at rest.
 
 Exit code: 0 done, 1 the finger does not answer or the controller is not certified, 2 unusable input.
@@ -51,9 +51,9 @@ from piezo_control.identification.measurement import Measurement, MeasurementErr
 from piezo_control.options import output_folder, within  # noqa: E402
 from piezo_control.parameters import ParameterError, build, dump, flatten  # noqa: E402
 from piezo_control.profile import Profile  # noqa: E402
-from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
-from piezo_control.servo.driver import DriverError, open_driver  # noqa: E402
-from piezo_control.servo.law import SENSOR_OLD  # noqa: E402
+from piezo_control.safety import LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
+from piezo_control.servo.driver import Driver, DriverError, applied, open_driver  # noqa: E402
+from piezo_control.servo.law import NO_CAUSE, SENSOR_OLD  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
 from piezo_control.servo.parameters import ServoParameters  # noqa: E402
 from piezo_control.shared import shared_folder  # noqa: E402
@@ -91,6 +91,29 @@ class Bench:
     scale: float
     zero: float = 0.0
 
+    @property
+    def card(self) -> ServoParameters:
+        """Scales of the card, as far as they are known."""
+        a = self.arguments
+        card = {
+            "write": a.write, "sensor_scale": self.scale, "sensor_zero": self.zero,
+            "amplifier_gain": a.amplifier_gain, "amplifier_zero": a.amplifier_zero,
+        }  # fmt: skip
+        return build(ServoParameters, card)
+
+    def open(self) -> Driver:
+        """Return the card, open."""
+        a = self.arguments
+        return open_driver(a.driver, a.driver_options, a.sample_time)
+
+    def applied(self) -> float:
+        """Return what the card puts out (V), of which nothing is changed; NaN: its driver does not say."""
+        driver, card = self.open(), self.card
+        try:
+            return applied(driver, card.amplifier_gain, card.amplifier_zero)
+        finally:
+            driver.close()
+
     def move(self, voltage: Profile, duration: float) -> Samples:
         """Apply a voltage (V over s) for `duration` s and return every sample; starts and ends at rest.
 
@@ -105,12 +128,8 @@ class Bench:
     def _move(self, voltage: Profile, duration: float) -> Samples:
         a = self.arguments
         h = a.sample_time
-        card = {
-            "write": a.write, "sensor_scale": self.scale, "sensor_zero": self.zero,
-            "amplifier_gain": a.amplifier_gain,
-        }  # fmt: skip
         parameters = replace(
-            build(ServoParameters, card), sensor_low=-LARGEST_DEFLECTION, sensor_high=LARGEST_DEFLECTION,
+            self.card, sensor_low=-LARGEST_DEFLECTION, sensor_high=LARGEST_DEFLECTION,
             model_tolerance=LARGEST_DEFLECTION, cycle_amplitude=LARGEST_DEFLECTION,
             missed_limit=10**6, late_share=1.0,
         )  # fmt: skip
@@ -121,23 +140,30 @@ class Bench:
             sample_time=h, command_low=VOLT * self.limits.voltage_low,
             command_high=VOLT * self.limits.voltage_high,
         )  # fmt: skip
-        servo = Servo(
-            open_driver(a.driver, a.driver_options, h), parameters, whole, straight, a.priority
-        )
-        servo.refer(Profile(voltage.time + SETTLING, VOLT * voltage.value, voltage.linear))
+        servo = Servo(self.open(), parameters, whole, straight, a.priority)
+        servo.refer(Profile([0.0], [VOLT * self.limits.rest]))
         taken = []
+
+        def go_on() -> Samples:
+            if servo.cause_code != NO_CAUSE or servo.stuck:
+                kind = LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer
+                raise kind(servo.cause or servo.stuck)
+            time.sleep(0.02)
+            servo.look_ahead()
+            return servo.samples()
+
         try:
             servo.start()
-            while servo.number * h < duration + 2.0 * SETTLING:
-                if servo.phase in (RAMPING, FAULT):
-                    raise (LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer)(
-                        servo.cause
-                    )
-                time.sleep(0.02)
-                servo.look_ahead()
-                taken.append(servo.samples())
+            while servo.number < 0 or servo.phase == RAMPING:
+                go_on()
+            begin = servo.number * h
+            moves = voltage.time + begin + SETTLING
+            servo.refer(Profile(moves, VOLT * voltage.value, voltage.linear))
+            while servo.number * h < begin + duration + 2.0 * SETTLING:
+                taken.append(go_on())
         finally:
-            servo.stop()
+            if left := servo.stop():
+                raise NoAnswer(left)
         return Samples(
             *(np.concatenate([getattr(s, name) for s in taken]) for name in vars(taken[0]))
         )
@@ -199,11 +225,13 @@ def gain(bench: Bench, rest: Rest, voltage: float) -> float:
     home = bench.limits.rest
     got = bench.move(Profile([0.0, 0.3], [home + voltage, home]), 0.6)
     there = np.isfinite(got.deflection)
-    up = there & (got.voltage == home + voltage)
+    # The voltage has been a deflection on its way, of which some digits are lost.
+    up = np.flatnonzero(there & (np.abs(got.voltage - (home + voltage)) < 1e-9))
+    if not up.size:
+        raise NoAnswer(f"no reading came while {home + voltage:.3g} V were on: sensor or card?")
     # The second half of the step: the ringing is over.
-    moved = float(np.mean(got.deflection[up][up.sum() // 2 :])) - rest.mean
-    least = max(5.0 * rest.noise, 1e-12)
-    if not up.any() or abs(moved) < least:
+    moved = float(np.mean(got.deflection[up[up.size // 2 :]])) - rest.mean
+    if abs(moved) < max(5.0 * rest.noise, 1e-12):
         raise NoAnswer(
             f"{voltage:.3g} V moved the reading by {moved * 1e6:.3g} µm, less than five times its noise "
             f"({rest.noise * 1e6:.3g} µm): sensor, amplifier or wiring?"
@@ -240,6 +268,12 @@ def commission(
     low, high, home = bench.limits.voltage_low, bench.limits.voltage_high, bench.limits.rest
     reach = max(home - low, high - home)
     side = 1.0 if high - home >= home - low else -1.0
+    now = bench.applied()
+    says = (
+        "the driver does not say what the card puts out" if math.isnan(now) else f"from {now:.3g} V"
+    )
+    if not agree(f"to rest at {home:.3g} V ({says})?"):
+        return None
     rest = at_rest(bench)
     bench.zero = rest.mean / bench.scale
     console.print(f"at rest: {rest.mean * 1e6:.4g} µm, noise {rest.noise * 1e9:.3g} nm rms")
@@ -343,6 +377,7 @@ def commission(
         "tolerance": max(ON_TARGET * stroke, noise),
         "frozen_voltage": FROZEN_VOLTAGE * (high - low),
         "amplifier_gain": a.amplifier_gain,
+        "amplifier_zero": a.amplifier_zero,
         "controller_file": str((folder / "feedback.yaml").resolve()),
         "feedforward_file": str((folder / "feedforward.yaml").resolve()),
     }
@@ -380,7 +415,7 @@ def main() -> int:
         print("commission: ended by a signal; the voltage is led to rest", file=sys.stderr)
         return 1
     if found is None:
-        console.print("stopped; the finger is at rest, nothing was written")
+        console.print("stopped; the finger is left where it is, nothing was written")
         return 1
     folder, certificate = found
     console.print(f"wrote {folder}", soft_wrap=True)
@@ -434,6 +469,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--amplifier-gain", type=float, default=1.0, metavar="V",
         help="V at the finger per unit that the card puts out (%(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--amplifier-zero", type=float, default=0.0, metavar="U",
+        help="what the card puts out for 0 V at the finger, in its unit (%(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--share",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drivers: how the servo reaches a sensor and an amplifier.
 
-A driver is a shared library with the five functions of ``piezo_driver.h``, given by its path or, if it
+A driver is a shared library with the functions of ``piezo_driver.h``, given by its path or, if it
 comes with the package (``udp``), by its name. Everything that is called in the loop takes plain addresses,
 so that it compiles with the loop.
 """
@@ -9,6 +9,7 @@ so that it compiles with the loop.
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -20,6 +21,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from piezo_control.parameters import ParameterError
+from piezo_control.safety import LARGEST_VOLTAGE, is_physical
 
 ABI = 1  # PIEZO_DRIVER_ABI of piezo_driver.h
 
@@ -41,13 +43,14 @@ class Driver(Protocol):
     read: Callable[..., int]
     write: Callable[..., int]
     """``read(device, edge)`` and ``write(device, voltage, edge)``, `edge` being the time of the present edge
-    (ns); both return what a C driver returns. They are compiled with the loop."""
+    (ns); both return what a C driver returns. They are compiled with the loop. A driver may have a method `applied`
+    as well, see :func:`applied`."""
 
     def error(self) -> str:
         """Return what went wrong last."""
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Let go of the device; called again, do nothing."""
 
 
 class Card(NamedTuple):
@@ -78,6 +81,7 @@ class SharedLibrary:
             self._functions.piezo_open.restype = ctypes.c_void_p
             self._functions.piezo_error.restype = ctypes.c_char_p
             self._functions.piezo_close.restype = None
+            self._applied = getattr(self._functions, "piezo_applied", None)
         except (OSError, AttributeError) as error:
             raise ParameterError(f"'driver' is '{driver}': {error}") from None
         if abi() != ABI:
@@ -95,12 +99,23 @@ class SharedLibrary:
 
     def error(self) -> str:
         """Return what went wrong last, in the driver's words."""
+        if not self._device:
+            return ""
         text = self._functions.piezo_error(ctypes.c_void_p(self._device)) or b""
         return text.decode(errors="replace")
 
+    def applied(self) -> float:
+        """Return what the card puts out, in its unit; NaN: it does not say."""
+        value = ctypes.c_double(math.nan)
+        if self._applied and self._applied(ctypes.c_void_p(self._device), ctypes.byref(value)):
+            return math.nan
+        return value.value
+
     def close(self) -> None:
-        """Let go of the device."""
-        self._functions.piezo_close(ctypes.c_void_p(self._device))
+        """Let go of the device; called again, do nothing."""
+        if self._device:
+            self._functions.piezo_close(ctypes.c_void_p(self._device))
+            self._device = None
 
 
 def open_driver(name: str, options: str, sample_time: float) -> Driver:
@@ -113,6 +128,21 @@ def open_driver(name: str, options: str, sample_time: float) -> Driver:
     for entry in entry_points(group="piezo_gripper.drivers", name=name):
         return entry.load()(options, sample_time)
     return SharedLibrary(name, options, sample_time)
+
+
+def applied(driver: Driver, gain: float, zero: float) -> float:
+    """Return what the card of a driver that was just opened puts out (V); NaN: the driver does not say.
+
+    `gain` (V) and `zero` are the amplifier's. Raises DriverError for a voltage that no card can mean.
+    """
+    said = getattr(driver, "applied", lambda: math.nan)()
+    voltage = gain * (said - zero)
+    if not math.isnan(said) and not is_physical(voltage, LARGEST_VOLTAGE):
+        raise DriverError(
+            f"the card says that it puts out {said:g}, which is {voltage:g} V, must be within "
+            f"±{LARGEST_VOLTAGE:g} V: gain or zero of the amplifier?"
+        )
+    return voltage
 
 
 def library(driver: str) -> Path:

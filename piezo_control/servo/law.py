@@ -61,7 +61,7 @@ from piezo_control.sensorless import (
     sensorless_rest,
     settle,
 )
-from piezo_control.servo.driver import FAILED, FRESH
+from piezo_control.servo.driver import FRESH, NONE_IN_TIME
 from piezo_control.servo.parameters import ServoParameters
 from piezo_control.shaping import ShapingParameters
 from piezo_control.thermal import REFERENCE_DEGC
@@ -82,12 +82,12 @@ LARGEST_ORDER = 32
 # Causes of a fault, and what each says of the value that was seen.
 (
     NO_CAUSE, SENSOR_SILENT, SENSOR_OLD, SENSOR_FROZEN, SENSOR_RANGE, MODEL, CYCLE, MISSED, LATE, DEVICE,
-    STOPPED, TEMPERATURE,
-) = range(12)  # fmt: skip
+    STOPPED, TEMPERATURE, NOT_WRITTEN,
+) = range(13)  # fmt: skip
 
 CAUSES: dict[int, Callable[[float, ServoParameters], str]] = {
     SENSOR_SILENT: lambda v, p: f"no reading of the sensor for {p.hold_time:g} s",
-    SENSOR_OLD: lambda v, p: f"readings are {v:.3g} s old, must be at most {p.age_limit:g} s",
+    SENSOR_OLD: lambda v, p: f"readings are {v:.3g} s old, must be within [0, {p.age_limit:g}] s",
     SENSOR_FROZEN: lambda v, p: (
         f"the sensor's reading stands still at {v * 1e6:.3f} µm for {p.frozen_time:g} s while the voltage "
         f"moved by {p.frozen_voltage:g} V"
@@ -110,6 +110,7 @@ CAUSES: dict[int, Callable[[float, ServoParameters], str]] = {
     DEVICE: lambda v, p: "the device failed; its voltage may not be at rest",
     STOPPED: lambda v, p: "stopped",
     TEMPERATURE: lambda v, p: "the temperature is missing or frozen",
+    NOT_WRITTEN: lambda v, p: f"the device took no voltage for {p.hold_time:g} s",
 }
 
 
@@ -181,6 +182,7 @@ class Watch(NamedTuple):
     cause_value: np.ndarray
     times: np.ndarray  # faults since the last reset
     silent: np.ndarray  # samples without a reading
+    unwritten: np.ndarray  # voltages in a row that did not go out
     raw: np.ndarray  # the last reading, in the card's unit
     same: np.ndarray  # samples since it changed
     raw_voltage: np.ndarray  # the voltage at which it changed
@@ -315,12 +317,13 @@ def watch_at_rest() -> Watch:
 
 
 def trip(w: Watch, cause: int, value: float) -> None:
-    """Latch a fault; the first cause is kept."""
+    """Latch a fault; the first cause is kept, but for a device that is gone, which may never come to rest."""
     w.times[0] += 1.0
-    if w.phase[0] == NORMAL or w.phase[0] == HOLDING:
-        w.phase[0] = RAMPING
+    if w.cause[0] == NO_CAUSE or cause == DEVICE:
         w.cause[0] = cause
         w.cause_value[0] = value
+    if w.phase[0] == NORMAL or w.phase[0] == HOLDING:
+        w.phase[0] = RAMPING
 
 
 def rearm(w: Watch) -> None:
@@ -329,6 +332,7 @@ def rearm(w: Watch) -> None:
     w.cause[0] = NO_CAUSE
     w.times[0] = 0.0
     w.silent[0] = 0.0
+    w.unwritten[0] = 0.0
     w.raw[0] = math.nan
     w.in_use[0] = -1.0
     w.samples[0] = 0.0
@@ -358,21 +362,18 @@ def servo_step(
     last = laws.feedforward_state.hysteresis.voltage[0]
     if c.feels:
         expect(laws.feeling, last)
-    if status == FAILED:
-        trip(w, DEVICE, 0.0)
-    elif status == FRESH:
+    if status == FRESH:
         w.silent[0] = 0.0
         judge_reading(c, w, raw, age, last)
         judge_model(c, laws, w, raw)
-    else:
+    elif status == NONE_IN_TIME:
         w.silent[0] += 1.0
-        if w.silent[0] > c.hold_samples:
-            trip(w, SENSOR_SILENT, 0.0)
-        elif w.phase[0] == NORMAL:
-            w.phase[0] = HOLDING
+        hold(c, w, w.silent[0], SENSOR_SILENT)
+    else:
+        trip(w, DEVICE, 0.0)
     if w.phase[0] == RAMPING or w.phase[0] == FAULT:
         return ramp(c, laws, w, last, share)
-    if status != FRESH:
+    if status != FRESH or w.unwritten[0] > 0.0:
         return last
     w.phase[0] = NORMAL
     deflection = c.sensor_scale * (raw - c.sensor_zero)
@@ -382,6 +383,33 @@ def servo_step(
         w.command[0] = control(laws, w, wanted, reference, deflection)
     judge_loop(c, w, reference, reference - deflection)
     return feedforward_step(laws.feedforward, laws.feedforward_state, w.command[0], share)
+
+
+def hold(c: Settings, w: Watch, missing: float, cause: int) -> None:
+    """Hold the voltage while something is missing, and trip after so many samples as the hold time has."""
+    if missing > c.hold_samples:
+        trip(w, cause, 0.0)
+    elif w.phase[0] == NORMAL:
+        w.phase[0] = HOLDING
+
+
+def judge_write(c: Settings, laws: Laws, w: Watch, status: int, before: float) -> None:
+    """Take note of what the card returned for a voltage; one that did not go out leaves the finger `before` it (V)."""
+    if status == FRESH:
+        w.unwritten[0] = 0.0
+        return
+    follow(laws, before)
+    w.unwritten[0] += 1.0
+    if status == NONE_IN_TIME:
+        hold(c, w, w.unwritten[0], NOT_WRITTEN)
+    else:
+        trip(w, DEVICE, 0.0)
+
+
+def follow(laws: Laws, voltage: float) -> None:
+    """Let the models go where the finger goes under `voltage` (V)."""
+    f = laws.feedforward
+    inverse_follow(f.operator, f.inverse, laws.feedforward_state.hysteresis, voltage)
 
 
 def touch(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float) -> float:
@@ -449,7 +477,7 @@ def judge_reading(c: Settings, w: Watch, raw: float, age: float, voltage: float)
         c.sensor_low <= deflection <= c.sensor_high
     ):
         trip(w, SENSOR_RANGE, deflection)
-    elif age > c.age_limit:
+    elif not 0.0 <= age <= c.age_limit:
         trip(w, SENSOR_OLD, age)
     elif w.same[0] > c.frozen_samples and abs(voltage - w.raw_voltage[0]) > c.frozen_voltage:
         trip(w, SENSOR_FROZEN, deflection)
@@ -509,10 +537,9 @@ def judge_time(c: Settings, w: Watch, late: float, missed: float) -> None:
 
 
 def ramp(c: Settings, laws: Laws, w: Watch, last: float, share: float) -> float:
-    """Return the next voltage (V) on the way to rest, at the end of which the fault is latched."""
+    """Return the next voltage (V) on the way to rest, where a fault is latched and a loop without one begins."""
+    if last == c.voltage.rest:  # it has gone out
+        w.phase[0] = NORMAL if w.cause[0] == NO_CAUSE else FAULT
     voltage = toward(c.voltage.rest, c.voltage.ramp * c.sample_time * share, last)
-    f = laws.feedforward
-    inverse_follow(f.operator, f.inverse, laws.feedforward_state.hysteresis, voltage)
-    if voltage == c.voltage.rest:
-        w.phase[0] = FAULT
+    follow(laws, voltage)
     return voltage

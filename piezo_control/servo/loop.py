@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import math
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import FunctionType
@@ -25,13 +26,14 @@ from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile, Signal
 from piezo_control.safety import FAULT, NORMAL, RAMPING
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
-from piezo_control.servo.driver import FAILED, FRESH, Driver
+from piezo_control.servo.driver import FRESH, Driver, applied
 from piezo_control.servo.driver import read_card as read
 from piezo_control.servo.driver import write_card as write
 from piezo_control.servo.law import (
     CAUSES,
     DEVICE,
     NO_CAUSE,
+    NOT_WRITTEN,
     SENSOR_SILENT,
     STOPPED,
     TEMPERATURE,
@@ -40,7 +42,9 @@ from piezo_control.servo.law import (
     Settings,
     Watch,
     empty_controller,
+    follow,
     judge_time,
+    judge_write,
     laws_of,
     put_controller,
     rearm,
@@ -55,6 +59,7 @@ from piezo_control.touch import push_of
 AHEAD = 1.0  # s: how far references are laid out in advance
 MARGIN = 5  # samples that a new reference leaves to the loop, which is about to read them
 KEPT = 5.0  # s of samples that wait for a reader
+WAIT = 0.1  # s, and the hold time: a driver that needs longer for one sample does not come back
 
 
 class Orders(NamedTuple):
@@ -102,51 +107,56 @@ class Loop(NamedTuple):
     references: References
     log: Log
     amplifier_gain: float
+    amplifier_zero: float
     at_next_edge: bool
 
 
 def run(loop: Loop, device: Any) -> None:
     """Run the loop on a device until it is asked to stop and the voltage is at rest.
 
-    `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
+    A device that takes no voltage ends it too, after the hold time. `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
     """
     clock = loop.clock
-    period = clock.period
     resets = loop.orders.reset[0]
-    voltage = loop.laws.feedforward_state.hysteresis.voltage[0]
+    voltage = before = loop.laws.feedforward_state.hysteresis.voltage[0]
     begin(clock)
     put_out = clock.edge[0]
-    while loop.orders.stop[0] == 0 or loop.watch.phase[0] != FAULT:
+    while loop.orders.stop[0] == 0 or (
+        loop.watch.phase[0] != FAULT and loop.watch.unwritten[0] <= loop.settings.hold_samples
+    ):
         missed = clock.missed[0]
         late = wait_for_edge(clock)
         if loop.orders.reset[0] != resets:
             resets = loop.orders.reset[0]
             # Of a finger that runs there is nothing to leave, and one that feels would take the push of now for none.
-            if loop.watch.phase[0] >= RAMPING:
+            if loop.watch.cause[0] != NO_CAUSE:
                 rearm(loop.watch)
-        if loop.orders.stop[0] != 0 and loop.watch.phase[0] < RAMPING:
-            trip(loop.watch, STOPPED, 0.0)
-        if loop.orders.fault[0] != NO_CAUSE and loop.watch.phase[0] < RAMPING:
-            trip(loop.watch, loop.orders.fault[0], 0.0)
+        if loop.watch.cause[0] == NO_CAUSE:
+            if loop.orders.stop[0] != 0:
+                trip(loop.watch, STOPPED, 0.0)
+            elif loop.orders.fault[0] != NO_CAUSE:
+                trip(loop.watch, loop.orders.fault[0], 0.0)
         judge_time(loop.settings, loop.watch, late * 1e-9, float(clock.missed[0] - missed))
-        written = FRESH
         if loop.at_next_edge:
-            written = write(device, voltage / loop.amplifier_gain, clock.edge[0])
-            # The next voltage goes out no sooner than at the next edge, or half a period after it.
-            share = max(0.0, (period - late) / period)
+            out = loop.amplifier_zero + voltage / loop.amplifier_gain
+            written = write(device, out, clock.edge[0])
+            put_out = now(clock)
+            judge_write(loop.settings, loop.laws, loop.watch, written, before)
         status = read(device, clock.edge[0])
-        if not loop.at_next_edge:
-            share = min(1.0, (now(clock) - put_out) / period)
-        if written == FAILED:
-            status = FAILED
+        # The output moves somewhere between call and return of `write`. The next one is called no sooner than this.
+        soonest = now(clock)
+        if loop.at_next_edge:
+            soonest = max(soonest, clock.edge[0] + clock.period)
+        share = min(1.0, (soonest - put_out) / clock.period)
+        before = loop.laws.feedforward_state.hysteresis.voltage[0]
         voltage = sample(loop, status, device.reading, share, late)
         if not loop.at_next_edge:
+            out = loop.amplifier_zero + voltage / loop.amplifier_gain
+            written = write(device, out, clock.edge[0])
             put_out = now(clock)
-            if write(device, voltage / loop.amplifier_gain, clock.edge[0]) == FAILED:
-                trip(loop.watch, DEVICE, 0.0)
+            judge_write(loop.settings, loop.laws, loop.watch, written, before)
     if loop.at_next_edge:
-        wait_for_edge(clock)
-        write(device, voltage / loop.amplifier_gain, clock.edge[0])
+        follow(loop.laws, before)  # what was to go out next never does
 
 
 def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int) -> float:
@@ -223,7 +233,13 @@ class Servo:
     feeling : Feeling, optional
         With it the loop follows its reference no further than the force limit lets it, in place of the controller.
 
-    Raises ParameterError for a controller that does not fit.
+    Raises ParameterError for a controller that does not fit, DriverError for a card that puts out what it cannot.
+
+    Attributes
+    ----------
+    begins_at : float
+        What the card puts out before the first voltage (V), from where the loop leads it to rest. NaN: its driver
+        does not say, so it has to be at rest.
     """
 
     def __init__(
@@ -243,10 +259,14 @@ class Servo:
         self.sample_time = h = feedback.sample_time
         self._thread_options = (priority, cpu)
         self.complaint = ""
+        law = Feedforward(feedforward, h)
+        self.begins_at = applied(driver, parameters.amplifier_gain, parameters.amplifier_zero)
+        if not math.isnan(self.begins_at):
+            law.follow(self.begins_at)
         ahead, kept = (1 << math.ceil(math.log2(max(span / h, 64))) for span in (2 * AHEAD, KEPT))
         self._loop = Loop(
             settings=settings_of(parameters, feedforward, h, feels=feeling is not None),
-            laws=laws_of(feedback, Feedforward(feedforward, h), feeling),
+            laws=laws_of(feedback, law, feeling),
             watch=watch_at_rest(),
             clock=clock_of(h, min(spin, 0.8 * h)),
             orders=Orders(*(np.zeros(1, dtype=np.int64) for _ in Orders._fields)),
@@ -257,6 +277,7 @@ class Servo:
                 *(np.full(kept, 0.0) for _ in range(5)),
             ),
             amplifier_gain=parameters.amplifier_gain,
+            amplifier_zero=parameters.amplifier_zero,
             at_next_edge=parameters.write == "next_edge",
         )
         self._force_limit = float(self._loop.laws.feeling.max_force[0])
@@ -273,7 +294,8 @@ class Servo:
         self._loop.watch.phase[0] = FAULT
         self._run(self._loop, self.driver.device)  # returns at once: told to stop, and at rest
         self._loop.orders.stop[0] = 0
-        self._loop.watch.phase[0] = NORMAL
+        is_at_rest = self.voltage == self._loop.settings.voltage.rest
+        self._loop.watch.phase[0] = NORMAL if is_at_rest else RAMPING
         self._thread.start()
         atexit.register(self.stop)
 
@@ -286,13 +308,39 @@ class Servo:
         """Whether the loop runs; until it is stopped it does, at rest after a fault."""
         return self._thread.is_alive()
 
-    def stop(self) -> None:
-        """Bring the voltage to rest, end the loop and close the device; interrupted, the program's end goes on with it."""
+    @property
+    def stuck(self) -> str:
+        """Say that the loop does not go on, because its driver does not come back; empty: it does."""
+        span = self.parameters.hold_time + WAIT
+        silence = time.monotonic() - 1e-9 * self._loop.clock.edge[0]
+        if not self.is_running or self.number < 0 or silence <= span + self.sample_time:
+            return ""
+        return (
+            f"the loop does not go on: the driver has not come back for more than {span:g} s; the voltage stays where "
+            f"it is, at {self.voltage:g} V"
+        )
+
+    def stop(self) -> str:
+        """Bring the voltage to rest, end the loop and close the device; interrupted, the program's end goes on with it.
+
+        Returns why the finger was not left at rest, empty if it was. A loop that its driver does not let go on keeps the
+        device; it ends at rest once the driver comes back, and another call of this closes it.
+        """
         self._loop.orders.stop[0] = 1
-        if self._thread.ident is not None:
-            self._thread.join()
+        waits = 0  # counted, not timed: a process that stands still does not wait
+        while self.is_running:
+            edge = self._loop.clock.edge[0]
+            self._thread.join(max(WAIT, self.sample_time))
+            waits = waits + 1 if edge == self._loop.clock.edge[0] else 0
+            if waits >= 10 and (stuck := self.stuck):
+                return stuck
         atexit.unregister(self.stop)
+        left = ""
+        rest = self._loop.settings.voltage.rest
+        if self._thread.ident is not None and (self.voltage != rest or self.cause_code == DEVICE):
+            left = f"{self.cause}: left at {self.voltage:g} V, rest is {rest:g} V"
         self.driver.close()
+        return left
 
     def feel(self, temperature_degc: float) -> None:
         """Tell the models the temperature; NaN is one that is missing: the body keeps the one it has."""
@@ -307,7 +355,7 @@ class Servo:
 
         Raises ParameterError for a finger that feels and is not at rest yet: it may still push.
         """
-        if self._loop.settings.feels and self.phase == RAMPING:
+        if self._loop.settings.feels and self.phase == RAMPING and self.cause_code != NO_CAUSE:
             raise ParameterError(
                 "the voltage is on its way to rest, and the tip may push: reset it there"
             )
@@ -409,12 +457,12 @@ class Servo:
         if code == NO_CAUSE:
             return ""
         text = CAUSES[code](float(self._loop.watch.cause_value[0]), self.parameters)
-        said = self.driver.error() if code in (DEVICE, SENSOR_SILENT) else ""
+        said = self.driver.error() if code in (DEVICE, SENSOR_SILENT, NOT_WRITTEN) else ""
         return f"{text}: {said}" if said else text
 
     @property
     def voltage(self) -> float:
-        """The last voltage (V)."""
+        """The last voltage (V) that the device took."""
         return float(self._loop.laws.feedforward_state.hysteresis.voltage[0])
 
     @property

@@ -37,6 +37,10 @@ class ServoParameters(SafetyParameters):
         1.0, "voltage at the finger per unit that the card puts out, negative for reversed wires",
         unit="V",
     )  # fmt: skip
+    amplifier_zero: float = parameter(
+        0.0,
+        "what the card puts out for 0 V at the finger, in its unit, such as the code in the middle",
+    )
     age_limit: float = parameter(
         1e-2, "a reading older than this is not acted upon", unit="s", low=1e-6, high=10.0
     )

@@ -6,7 +6,8 @@
  *   /sys/bus/iio/devices/iio:device0/in_voltage0_raw /sys/bus/iio/devices/iio:device1/out_voltage0_raw
  *
  * Readings and voltages are in raw codes: `sensor_scale` of the servo is m per code, `amplifier_gain` V per
- * code. A read takes as long as the conversion, so a converter on I2C or SPI keeps some hundred to some
+ * code, `sensor_zero` and `amplifier_zero` the codes of 0 m and 0 V: minus the `offset` in sysfs, such as the code in the
+ * middle of a bipolar converter whose code 0 is its negative end. A read takes as long as the conversion, so a converter on I2C or SPI keeps some hundred to some
  * thousand samples a second; design the controller for that.
  */
 #define _GNU_SOURCE
@@ -18,6 +19,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/file.h>
 #include <unistd.h>
 
 struct piezo_device {
@@ -49,10 +51,17 @@ piezo_device *piezo_open(const char *options, double sample_time, char *error, s
   }
   device->in = open(in, O_RDONLY | O_CLOEXEC);
   if (device->in < 0) snprintf(error, size, "%s: %s", in, strerror(errno));
-  device->out = device->in < 0 ? -1 : open(blank + 1, O_WRONLY | O_CLOEXEC);
+  device->out = device->in < 0 ? -1 : open(blank + 1, O_RDWR | O_CLOEXEC);
+  if (device->in >= 0 && device->out < 0 && errno == EACCES) device->out = open(blank + 1, O_WRONLY | O_CLOEXEC);
   if (device->in >= 0 && device->out < 0) {
     snprintf(error, size, "%s: %s", blank + 1, strerror(errno));
     close(device->in);
+  } else if (device->out >= 0 && flock(device->out, LOCK_EX | LOCK_NB)) {
+    snprintf(error, size, "%s: %s", blank + 1,
+             errno == EWOULDBLOCK ? "another servo writes to it, only one may" : strerror(errno));
+    close(device->in);
+    close(device->out);
+    device->out = -1;
   }
   free(in);
   if (device->out < 0) {
@@ -62,17 +71,22 @@ piezo_device *piezo_open(const char *options, double sample_time, char *error, s
   return device;
 }
 
-int piezo_read(piezo_device *device, struct piezo_reading *reading) {
+static int code(int file, double *value) {
   char text[64];
-  ssize_t size = pread(device->in, text, sizeof text - 1, 0);
-  if (size < 0) return failed(device, "input");
+  ssize_t size = pread(file, text, sizeof text - 1, 0);
+  if (size < 0) return PIEZO_FAILED;
   text[size] = 0;
   char *end;
-  double value = strtod(text, &end);
-  if (end == text) return PIEZO_NONE_IN_TIME;
-  reading->deflection = value;
+  *value = strtod(text, &end);
+  return end == text ? PIEZO_NONE_IN_TIME : PIEZO_FRESH;
+}
+
+int piezo_applied(piezo_device *device, double *voltage) { return code(device->out, voltage); }
+
+int piezo_read(piezo_device *device, struct piezo_reading *reading) {
+  int status = code(device->in, &reading->deflection);
   reading->age = 0.0;
-  return PIEZO_FRESH;
+  return status == PIEZO_FAILED ? failed(device, "input") : status;
 }
 
 int piezo_write(piezo_device *device, double voltage) {

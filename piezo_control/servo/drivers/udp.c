@@ -8,6 +8,10 @@
  * (uint64) and a value (double). The servo sends a voltage (V); the finger applies it and answers at once with
  * the same number and the deflection (m) that it measured just before. piezo_read waits for that answer for
  * half a period at most, and ignores older ones.
+ *
+ * One servo leads a finger. Its numbers rise from 1 on, and the finger applies no voltage whose number is not above the
+ * last one. Number 0 says from the servo that it lets go, and brings its last voltage once more; from the finger that
+ * somebody else leads it. A servo that is silent for the finger's hold time has let go as well.
  */
 #define _GNU_SOURCE
 #include "piezo_driver.h"
@@ -33,6 +37,7 @@ struct piezo_device {
   int socket;
   int64_t limit; /* ns to wait for an answer */
   uint64_t sent, received;
+  double voltage; /* sent last */
   int64_t sent_at; /* ns */
   char error[160];
 };
@@ -108,6 +113,7 @@ int piezo_write(piezo_device *device, double voltage) {
     return failed(device, "send");
   }
   device->sent = out.number;
+  device->voltage = voltage;
   device->sent_at = now();
   return PIEZO_FRESH;
 }
@@ -124,6 +130,8 @@ int piezo_read(piezo_device *device, struct piezo_reading *reading) {
       reading->age = 1e-9 * (double)(now() - device->sent_at);
       return PIEZO_FRESH;
     }
+    if (size == (ssize_t)sizeof in && !memcmp(in.word, WORD, sizeof WORD) && !in.number)
+      snprintf(device->error, sizeof device->error, "somebody else leads this finger");
     if (size >= 0) continue;
     if (errno == ECONNREFUSED) {
       snprintf(device->error, sizeof device->error, "nobody answers at this address");
@@ -142,6 +150,9 @@ int piezo_read(piezo_device *device, struct piezo_reading *reading) {
 const char *piezo_error(piezo_device *device) { return device->error; }
 
 void piezo_close(piezo_device *device) {
+  struct datagram out = {.number = 0, .value = device->voltage};
+  memcpy(out.word, WORD, sizeof WORD);
+  if (device->sent) (void)!send(device->socket, &out, sizeof out, MSG_DONTWAIT);
   close(device->socket);
   free(device);
 }
