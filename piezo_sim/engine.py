@@ -588,8 +588,8 @@ def run_touching_samples(
     for n in range(len(inputs.reference)):
         look(plant, state, inputs.normal[n], inputs.uniform[n])
         deflection = state.readings[0]
-        feel(law, law_state, finger.expected[0], deflection)
         limit = finger.max_force[first + n]
+        feel(law, law_state, finger.expected[0], deflection, limit)
         command = press(law, law_state, inputs.reference[n], deflection, limit)
         warmth = models_state.body.degc[0] - REFERENCE_DEGC
         voltage = inverse_step(models, models_state, command, inputs.temperature[n], 1.0)

@@ -2,6 +2,7 @@
 """A finger that stops at a force and holds it, without a force sensor: computed loops, simulated objects."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.linalg import expm
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.profile import Profile
 from piezo_control.sensorless import Sensorless, SensorlessParameters
-from piezo_control.touch import Touch, TouchParameters
+from piezo_control.touch import LOOPS, PLAY, Touch, TouchParameters, advance
 from piezo_sim.engine import run_touching
 from piezo_sim.experiment.sensorless import identified
 from piezo_sim.plant.cantilever import Cantilever, CantileverParameters
@@ -158,6 +159,90 @@ def test_the_force_is_held_while_the_temperature_rises(plant, models):
         held = force[0]
         assert np.max(np.abs(force - held)) < 0.15e-3, (plant, stiffness)
         assert 0.8 * limit < force.min(), (plant, stiffness)  # nothing is dropped
+
+
+def press(approach, contact, limit=LIMIT, touch=DEFAULTS):
+    """Return true force and estimate (N) of a finger that is its models, with `approach` (m) from 0.2 s on."""
+    reference = Profile(
+        [BEGIN, *(2 * BEGIN + H * np.arange(len(approach)))], [0.0, *approach], linear=True
+    )
+    got, push = run_touching(
+        CantileverParameters(contact=contact),
+        touch,
+        SensorlessParameters(),
+        TemperatureParameters(),
+        reference,
+        Profile([0.0], [limit]),
+        len(approach) + round(2 * BEGIN / H),
+    )
+    return -got.total_force, push
+
+
+@pytest.mark.parametrize(
+    "stiffness, model_error, speed, amplitude, frequency",
+    [
+        (100.0, 0.03, 100e-9, 0.5e-6, 20.0),
+        (300.0, 0.03, 100e-9, 0.5e-6, 20.0),
+        (400.0, 0.03, 100e-9, 0.5e-6, 20.0),
+        (1000.0, 0.03, 100e-9, 0.2e-6, 50.0),
+        (3000.0, 0.1, 100e-9, 0.2e-6, 50.0),
+        (200.0, 0.03, 1e-6, 0.5e-6, 50.0),
+        (300.0, 0.03, 10e-9, 0.0, 0.0),
+    ],
+)
+def test_a_reference_that_shakes_or_creeps_passes_no_limit(
+    stiffness, model_error, speed, amplitude, frequency
+):
+    """To and fro is no way on which the models could be off, nor is what rises while the finger closes drift."""
+    time = H * np.arange(round(min(2.5e-6 / speed, 300.0) / H))
+    shaken = 4.9e-6 + speed * time + amplitude * np.sin(2.0 * np.pi * frequency * time)
+    contact = ContactParameters(stiffness, 0.05, AWAY)
+    force, push = press(shaken, contact, touch=TouchParameters(model_error=model_error))
+    assert force.max() < LIMIT + TOLD["prandtl_ishlinskii"]
+    assert np.max(np.abs(push - force)) < 0.03e-3
+
+
+def test_a_random_walk_strikes_no_blows_on_a_hard_wall():
+    """Opening faster than it closes sets a finger ringing: the wall was hit with six times the limit."""
+    every = 5  # samples, white noise behind a low-pass of 20 Hz
+    walk, kept = [0.0], math.exp(-2.0 * math.pi * 20.0 * every * H)
+    for step in np.random.default_rng(3).standard_normal(20000):
+        walk.append(kept * walk[-1] + 0.5e-6 * math.sqrt(1.0 - kept**2) * step)
+    walk = np.interp(np.arange(100000), every * np.arange(len(walk)), walk)
+    force, _ = press(6e-6 + walk, ContactParameters(1e5, 0.05, AWAY))
+    # A tip of modal mass a2 / s_p that meets a spring k at v; ringing brings it at twice the command's speed.
+    speed = 2.1 * DEFAULTS.force_rate * ELASTIC * LIMIT
+    blow = speed * math.sqrt(1e5 * DynamicsParameters().denominator[0] / ELASTIC)
+    assert 0.9 * LIMIT < force.max() < LIMIT + blow
+
+
+def test_a_limit_below_the_least_that_is_felt_is_no_drift():
+    limit = 0.4 * DEFAULTS.touch_force
+    force, _ = press(np.full(300000, 8e-6), ContactParameters(3000.0, 0.05, AWAY), limit)
+    assert force.max() < 1.2 * limit
+
+
+def test_loops_within_loops_bring_back_what_was_learned_at_their_turns():
+    """Whatever the command did since the outermost turn, and always as much as is allowed was learned."""
+    law = law_of()
+    c, s = law._coefficients, law.state
+    turns = [12e-6 * (-0.8) ** n for n in range(LOOPS + 4)]
+    inwards = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise([0.0, *turns])])
+    shaking = turns[-1] + 0.4e-6 * np.sin(np.linspace(0.0, 200.0, 20000))
+    outwards = np.linspace(shaking[-1], turns[0], 500)
+    shares, ways = [], []
+    for command in (*inwards, *shaking, *outwards):
+        s.command[0] = command
+        trust, bound = advance(c, s)
+        s.share[0] = min(s.share[0] + trust, bound)
+        shares.append(s.share[0])
+        ways.append(s.way[0])
+    outermost = turns[0] - PLAY
+    at_turn = c.model_error * outermost
+    assert shares[199] == pytest.approx(at_turn)
+    bound = at_turn + c.model_error * np.abs(outermost - np.array(ways))
+    assert np.max((shares - bound)[199:]) < 1e-12
+    assert shares[-1] == pytest.approx(at_turn, abs=1e-12)
 
 
 def test_position_is_reached_and_kept_where_nothing_is_in_the_way(models):

@@ -391,7 +391,7 @@ def touch(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float
         command = modelled_deflection(laws.feedforward, laws.feedforward_state)
         touch_start(f.touch_state, command, deflection, f.expected[0])
         w.in_use[0] = wanted
-    feel(f.touch, f.touch_state, f.expected[0], deflection)
+    feel(f.touch, f.touch_state, f.expected[0], deflection, f.max_force[0])
     return press(f.touch, f.touch_state, reference, deflection, f.max_force[0])
 
 
