@@ -39,8 +39,7 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from piezo_control.dynamics import DynamicsParameters
-from piezo_control.parameters import parameter
+from piezo_control.parameters import ParameterError, parameter
 
 PULL_TIME = 0.02
 """Time constant (s) with which a pull, which no object gives, is taken for an error of the models."""
@@ -66,13 +65,6 @@ class TouchParameters:
         5e-3, "the finger pushes with no more than this, whatever is asked for", unit="N",
         low=1e-6, high=10.0,
     )  # fmt: skip
-    elastic_constant: float = parameter(
-        DynamicsParameters.elastic_constant,
-        "deflection per tip force",
-        unit="m/N",
-        low=1e-9,
-        high=10.0,
-    )
     position_rate: float = parameter(
         200.0, "rate of the loop that follows the reference", unit="1/s", low=1.0, high=1e4
     )
@@ -128,21 +120,33 @@ class TouchState(NamedTuple):
 
 
 def touch_coefficients(
-    parameters: TouchParameters, sample_time: float, command_low: float, command_high: float
+    parameters: TouchParameters,
+    elastic_constant: float,
+    sample_time: float,
+    command_low: float,
+    command_high: float,
 ) -> TouchCoefficients:
-    """Return the coefficients for a sample time (s) and limits of the command (m)."""
+    """Return the coefficients for a finger's elastic constant (m/N), sample time (s) and limits of the command (m).
+
+    Raises ParameterError for an elastic constant that gives no force.
+    """
     p = parameters
+    if not elastic_constant > 0.0:
+        raise ParameterError(
+            f"'dynamics.elastic_constant' is {elastic_constant:g} m/N, must be above 0 where a force is told from "
+            "a deflection: `identify stiffness` finds it"
+        )
     return TouchCoefficients(
-        p.elastic_constant,
+        elastic_constant,
         p.position_rate * sample_time,
         p.force_rate * sample_time,
         sample_time / (p.filter_time + sample_time),
         p.model_error,
-        p.touch_force * p.elastic_constant,
+        p.touch_force * elastic_constant,
         sample_time / p.zero_time,
         sample_time / (PULL_TIME + sample_time),
         sample_time / (CLOSING_TIME + sample_time),
-        p.force_rate * sample_time * p.elastic_constant * p.force_limit,
+        p.force_rate * sample_time * elastic_constant * p.force_limit,
         command_low,
         command_high,
     )
@@ -255,7 +259,7 @@ def press(
 class Touch:
     """The law of one finger at a fixed `sample_time` (s), touching nothing at command 0.
 
-    >>> law = Touch(TouchParameters(), sample_time=1e-4, command_low=-22e-6, command_high=22e-6)
+    >>> law = Touch(TouchParameters(), elastic_constant=3.1e-3, sample_time=1e-4, command_low=-22e-6, command_high=22e-6)
     >>> law.step(1e-6, deflection=0.0, expected=0.0, max_force=1e-3) < 1e-6
     True
     """
@@ -263,12 +267,15 @@ class Touch:
     def __init__(
         self,
         parameters: TouchParameters,
+        elastic_constant: float,
         sample_time: float,
         command_low: float,
         command_high: float,
     ) -> None:
         self.parameters = parameters
-        self._coefficients = touch_coefficients(parameters, sample_time, command_low, command_high)
+        self._coefficients = touch_coefficients(
+            parameters, elastic_constant, sample_time, command_low, command_high
+        )
         self.state = touch_rest()
 
     def step(self, reference: float, deflection: float, expected: float, max_force: float) -> float:

@@ -263,7 +263,13 @@ def run_touching(
     sampled = cantilever.model(plant)
     finger = as_arrays(
         TouchingFinger(
-            touch_coefficients(touch, plant.sample_time, command.command_low, command.command_high),
+            touch_coefficients(
+                touch,
+                models.dynamics.elastic_constant,
+                plant.sample_time,
+                command.command_low,
+                command.command_high,
+            ),
             touch_rest(),
             inverse,
             sensorless_rest(inverse, degc),

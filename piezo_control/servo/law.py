@@ -260,7 +260,7 @@ def feeling_of(
 ) -> Feeling:
     """Return what feels for a finger at rest at `degc` (°C), with sample time and command range of `feedback`.
 
-    Raises ParameterError for models that have no inverse.
+    Raises ParameterError for models that have no inverse or no elastic constant.
     """
     h = feedback.sample_time
     # The models follow a voltage here, and never shape a reference.
@@ -268,7 +268,13 @@ def feeling_of(
     return Feeling(
         as_arrays(coefficients),
         as_arrays(sensorless_rest(coefficients, degc)),
-        touch_coefficients(touch, h, feedback.command_low, feedback.command_high),
+        touch_coefficients(
+            touch,
+            models.dynamics.elastic_constant,
+            h,
+            feedback.command_low,
+            feedback.command_high,
+        ),
         as_arrays(touch_rest()),
         expected=np.zeros(1),
         temperature=np.full(1, math.nan),
