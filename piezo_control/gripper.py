@@ -23,6 +23,8 @@ from dataclasses import dataclass
 from itertools import count
 from typing import NamedTuple
 
+import numpy as np
+
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
 from piezo_control.touch import TouchParameters
@@ -40,7 +42,7 @@ AT_LIMIT = 0.9
 """Share of the force limit from which on a finger has stalled."""
 
 REST_TIME = 0.05
-"""A finger rests when it has stayed in place for so long (s)."""
+"""A finger rests when it has stayed in place for so long (s); one that stalls, for as long as its line has to move it."""
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,7 @@ class Motion:
         openings = [waypoint.opening for waypoint in goal.waypoints] or [goal.opening]
         self.closing = max(map(self._reference, openings)) > min(references)
         self._arrivals = [math.inf] * len(references)
+        self._stall_times = [REST_TIME] * len(references)
         self._places = [(math.inf, math.nan)] * len(references)  # since when (s) a tip is where (m)
 
     def departed(self, finger: int) -> bool:
@@ -241,19 +244,24 @@ class Motion:
             return hold(target)
         instants = [time, *(time + waypoint.time for waypoint in way)]
         values = [reference, *(self._reference(waypoint.opening) for waypoint in way)]
-        return Profile(instants, values, linear=True)
+        line = Profile(instants, values, linear=True)
+        speeds = np.abs(np.diff(line.value) / np.diff(line.time))
+        slowest = np.min(speeds, where=speeds > 0.0, initial=self._parameters.speed_limit)
+        # On its line a tip stays in place, within half a tolerance, for half of this time.
+        self._stall_times[finger] = max(REST_TIME, self._parameters.tolerance / slowest)
+        return line
 
     def _reference(self, opening: float) -> float:
         """Return the reference (m) of either finger at an opening (m)."""
         return (self._parameters.rest_opening - opening) / 2.0
 
-    def rests(self, finger: int, time: float, deflection: float) -> bool:
-        """Take note of where a tip is (m) at its time (s); say whether it has been there for a while."""
+    def rests(self, finger: int, time: float, deflection: float) -> float:
+        """Take note of where a tip is (m) at its time (s); return for how long (s) it has been there."""
         since, place = self._places[finger]
         if not abs(deflection - place) <= self._parameters.tolerance / 2.0:
             since = time
             self._places[finger] = time, deflection
-        return time - since >= REST_TIME
+        return time - since
 
     def decide(
         self, times: Sequence[float], deflections: Sequence[float], pushes: Sequence[float]
@@ -266,16 +274,17 @@ class Motion:
         force = force_of(pushes)
         error = opening_of(p, deflections) - self.goal.opening
         reached = abs(error) <= p.tolerance
-        rest = [self.rests(*finger) for finger in zip(count(), times, deflections)]
+        still = [self.rests(*finger) for finger in zip(count(), times, deflections)]
+        stands = all(time >= enough for time, enough in zip(still, self._stall_times))
         over = [time - arrival for time, arrival in zip(times, self._arrivals)]
         stalled = [push >= AT_LIMIT * self.goal.max_force for push in pushes]
-        if self.closing and any(stalled) and all(rest):
+        if self.closing and any(stalled) and stands:
             # A finger that touches nothing goes on to the end of its line.
             if all(at_limit or late >= 0.0 for at_limit, late in zip(stalled, over)):
                 text = f"stopped by {force:g} N, limit {self.goal.max_force:g} N"
                 return Outcome(True, reached, True, text)
         beyond = min(over)
-        if beyond >= 0.0 and reached and all(rest):
+        if beyond >= 0.0 and reached and min(still) >= REST_TIME:
             return Outcome(True, True, False, "reached")
         if beyond > p.settling_time:
             text = (

@@ -28,6 +28,9 @@ class Sequence:
     last one is new, but for a leap of more than `LARGEST_GAP`, which no loss explains.
     """
 
+    LARGEST = 2**53
+    """A number above it is no count: at one sample a microsecond it is 285 years, and a float holds no larger one."""
+
     LARGEST_GAP = 10**7
     RISING = 3
     """So many stray numbers that rise begin a new run, with `gaps`."""
@@ -44,6 +47,8 @@ class Sequence:
             return FIRST
         if number == self.next - 1:
             return REPEATED
+        if number > self.LARGEST:
+            return STRAY
         if number == self.next or self.next < 0 and self.gaps:
             return NEW
         if self.gaps and self.next < number < self.next + self.LARGEST_GAP:
@@ -60,7 +65,7 @@ class Sequence:
         if self._strays and number <= self._strays[-1]:
             self._strays.clear()
         self._strays.append(number)
-        if not self.gaps or len(self._strays) < self.RISING:
+        if not self.gaps or number > self.LARGEST or len(self._strays) < self.RISING:
             return False
         self.count(number - 1)
         return True

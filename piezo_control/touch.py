@@ -6,11 +6,19 @@ The models of hysteresis, heat and creep say where a tip that nobody pushes woul
 
     push = (lowpass(expected - deflection) - zero) / s_p.
 
-The models are off by a share of the way that the tip has gone, so while less than `touch_force` is felt, `zero`
-follows what is missing by up to `model_error` times the way, and slowly at rest. It follows without a bound
-where it says that something pulls, which no object does here (an adhesive one would be felt late), but no faster
-than a vibration, of which it would take one half only. From `touch_force` on it stays. What the models are off by on the way in contact is the error of the push; an object so soft that
-a tip loses less than `model_error` of its way on it is not felt.
+Of what is missing, the models may be off by two parts, `zero` = `share` + `drift`, which are learned while less than
+`touch_force` and half of what is allowed is felt:
+
+- `share` of the way that the command has gone: it follows by up to `model_error` times the way. What a hysteresis is
+  off by returns where its input returns (the return-point memory), so a command that comes back to where it once
+  turned brings back at most the `share` of that turn: a reference that shakes learns no force away.
+- `drift` with time: slowly, and not while the reference closes, when a rise may be an object.
+
+Both follow without a bound where something pulls, on the way and at rest, which no object does here (an adhesive one
+would be felt late), but no faster than a vibration, of which they would take one half only.
+
+What the models are off by on the way in contact is the error of the push; an object so soft that a tip loses less than
+`model_error` of its way on it is not felt.
 
 The command integrates the slower of two wishes, to follow the reference and to push with `max_force`:
 
@@ -31,14 +39,22 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from piezo_control.dynamics import DynamicsParameters
-from piezo_control.parameters import parameter
+from piezo_control.parameters import ParameterError, parameter
 
 PULL_TIME = 0.02
 """Time constant (s) with which a pull, which no object gives, is taken for an error of the models."""
 
 PLAY = 1e-7
 """Half the width (m) of the play behind which the command counts as way, so that noise is none."""
+
+LOOPS = 16
+"""So many turns of the command within each other are remembered; in a loop within these no way is trusted."""
+
+CLOSING_TIME = 1.0
+"""Time constant (s) of the mean of the reference that tells whether the finger closes."""
+
+STILL = 2e-9
+"""A mean of the reference that rises by less than this (m) in `CLOSING_TIME` stands still."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +65,6 @@ class TouchParameters:
         5e-3, "the finger pushes with no more than this, whatever is asked for", unit="N",
         low=1e-6, high=10.0,
     )  # fmt: skip
-    elastic_constant: float = parameter(
-        DynamicsParameters.elastic_constant,
-        "deflection per tip force",
-        unit="m/N",
-        low=1e-9,
-        high=10.0,
-    )
     position_rate: float = parameter(
         200.0, "rate of the loop that follows the reference", unit="1/s", low=1.0, high=1e4
     )
@@ -87,6 +96,7 @@ class TouchCoefficients(NamedTuple):
     touch: float  # m
     zero_rate: float
     pull_rate: float
+    closing_rate: float
     opening: float  # m, the most that it opens by
     command_low: float
     command_high: float
@@ -97,27 +107,46 @@ class TouchState(NamedTuple):
 
     missing: list[float]  # expected - deflection (m), once and twice low-passed
     behind: list[float]  # reference - deflection (m), once and twice low-passed
-    zero: list[float]  # m
+    share: list[float]  # m
+    drift: list[float]  # m
     way: list[float]  # the command (m) behind a play
+    heading: list[float]  # 1 or -1, where the way went last; 0: nowhere yet
+    turns: list[float]  # where the way (m) turned, a loop within the other
+    shares: list[float]  # `share` at these turns
+    depth: list[float]  # number of turns that are remembered
+    mean: list[float]  # reference (m), slowly low-passed once and twice
     reference: list[float]  # m, the last one
     command: list[float]  # m, the last one
 
 
 def touch_coefficients(
-    parameters: TouchParameters, sample_time: float, command_low: float, command_high: float
+    parameters: TouchParameters,
+    elastic_constant: float,
+    sample_time: float,
+    command_low: float,
+    command_high: float,
 ) -> TouchCoefficients:
-    """Return the coefficients for a sample time (s) and limits of the command (m)."""
+    """Return the coefficients for a finger's elastic constant (m/N), sample time (s) and limits of the command (m).
+
+    Raises ParameterError for an elastic constant that gives no force.
+    """
     p = parameters
+    if not elastic_constant > 0.0:
+        raise ParameterError(
+            f"'dynamics.elastic_constant' is {elastic_constant:g} m/N, must be above 0 where a force is told from "
+            "a deflection: `identify stiffness` finds it"
+        )
     return TouchCoefficients(
-        p.elastic_constant,
+        elastic_constant,
         p.position_rate * sample_time,
         p.force_rate * sample_time,
         sample_time / (p.filter_time + sample_time),
         p.model_error,
-        p.touch_force * p.elastic_constant,
+        p.touch_force * elastic_constant,
         sample_time / p.zero_time,
         sample_time / (PULL_TIME + sample_time),
-        p.force_rate * sample_time * p.elastic_constant * p.force_limit,
+        sample_time / (CLOSING_TIME + sample_time),
+        p.force_rate * sample_time * elastic_constant * p.force_limit,
         command_low,
         command_high,
     )
@@ -125,7 +154,12 @@ def touch_coefficients(
 
 def touch_rest() -> TouchState:
     """Return the state of a finger that touches nothing, at command 0."""
-    return TouchState([0.0, 0.0], [0.0, 0.0], [0.0], [0.0], [0.0], [0.0])
+    pairs = ([0.0, 0.0] for _ in range(3))
+    ones = ([0.0] for _ in range(7))
+    return TouchState(
+        next(pairs), next(pairs), next(ones), next(ones), next(ones), next(ones), [0.0] * LOOPS,
+        [0.0] * LOOPS, next(ones), next(pairs), next(ones), next(ones),
+    )  # fmt: skip
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
@@ -133,10 +167,11 @@ def touch_rest() -> TouchState:
 
 def touch_start(s: TouchState, command: float, deflection: float, expected: float) -> None:
     """Let a tip that nobody pushes begin at a `command` (m), its reference where it is (m)."""
-    s.missing[0] = s.missing[1] = s.zero[0] = expected - deflection
+    s.missing[0] = s.missing[1] = s.drift[0] = expected - deflection
+    s.share[0] = s.heading[0] = s.depth[0] = 0.0
     s.behind[0] = s.behind[1] = 0.0
     s.way[0] = s.command[0] = command
-    s.reference[0] = deflection
+    s.mean[0] = s.mean[1] = s.reference[0] = deflection
 
 
 def low_pass(state: list[float], rate: float, value: float) -> None:
@@ -145,21 +180,64 @@ def low_pass(state: list[float], rate: float, value: float) -> None:
     state[1] += rate * (state[0] - state[1])
 
 
+def missing_to(s: TouchState) -> float:
+    """Return what is missing (m) beyond what the models are off by."""
+    return s.missing[1] - s.share[0] - s.drift[0]
+
+
 def push_of(c: TouchCoefficients, s: TouchState) -> float:
     """Return the force (N) that pushes the tip back, as estimated; positive against closing."""
-    return (s.missing[1] - s.zero[0]) / c.elastic_constant
+    return missing_to(s) / c.elastic_constant
 
 
-def feel(c: TouchCoefficients, s: TouchState, expected: float, deflection: float) -> None:
-    """Take a reading (m) into the estimate of the push; `expected` (m) is that of a tip nobody pushes."""
-    low_pass(s.missing, c.filter_rate, expected - deflection)
-    way = min(max(s.way[0], s.command[0] - PLAY), s.command[0] + PLAY)
-    trust = c.model_error * abs(way - s.way[0])
+def advance(c: TouchCoefficients, s: TouchState) -> tuple[float, float]:
+    """Let the way follow the command; return how much `share` (m) may change for it, and its bound (m)."""
+    bound = math.inf
+    before = s.way[0]
+    way = min(max(before, s.command[0] - PLAY), s.command[0] + PLAY)
+    if way == before:
+        return 0.0, bound
+    heading = 1.0 if way > before else -1.0
+    depth = int(s.depth[0])
+    if heading * s.heading[0] < 0.0 and depth < LOOPS:
+        s.turns[depth] = before
+        s.shares[depth] = s.share[0]
+        depth += 1
+    while depth > 0:
+        # The last turn lies behind, but for one that was no longer remembered; the one before it lies ahead.
+        ahead = depth - 1 if heading * (s.turns[depth - 1] - before) > 0.0 else depth - 2
+        if ahead < 0:
+            break
+        bound = min(bound, s.shares[ahead] + c.model_error * abs(s.turns[ahead] - way))
+        if heading * (s.turns[ahead] - way) > 0.0:
+            break
+        depth = ahead  # the loop is closed
     s.way[0] = way
-    push = s.missing[1] - s.zero[0]
-    if push < c.touch:
-        rate = c.pull_rate if push < 0.0 else c.zero_rate
-        s.zero[0] += rate * push + min(max(push, -trust), trust)
+    s.heading[0] = heading
+    s.depth[0] = depth
+    return (c.model_error * abs(way - before) if depth < LOOPS else 0.0), bound
+
+
+def feel(
+    c: TouchCoefficients, s: TouchState, expected: float, deflection: float, max_force: float
+) -> None:
+    """Take a reading (m) into the estimate of the push, of which `max_force` (N) is allowed.
+
+    `expected` (m) is the deflection of a tip that nobody pushes.
+    """
+    low_pass(s.missing, c.filter_rate, expected - deflection)
+    trust, bound = advance(c, s)
+    push = missing_to(s)
+    is_felt = push >= min(c.touch, 0.5 * c.elastic_constant * max_force)
+    learned = 0.0 if is_felt else min(max(push, -trust), trust)
+    s.share[0] = min(s.share[0] + learned, bound)
+    if not is_felt:
+        push = missing_to(s)
+        if push < 0.0:
+            part = s.share if trust > 0.0 else s.drift
+            part[0] += c.pull_rate * push
+        elif s.mean[0] - s.mean[1] < STILL:
+            s.drift[0] += c.zero_rate * push
 
 
 def press(
@@ -167,10 +245,12 @@ def press(
 ) -> float:
     """Return the next command (m): towards the `reference` (m), pushing with `max_force` (N) at most."""
     low_pass(s.behind, c.filter_rate, reference - deflection)
+    low_pass(s.mean, c.closing_rate, reference)
     ahead = reference - s.reference[0] + c.position_rate * s.behind[1]
     s.reference[0] = reference
     push = c.force_rate * c.elastic_constant * (max_force - push_of(c, s))
-    change = max(min(ahead, push), -c.opening)
+    retreat = c.force_rate * max(c.elastic_constant * max_force, c.touch)
+    change = max(min(max(ahead, -retreat), push), -c.opening)
     command = min(max(s.command[0] + change, c.command_low), c.command_high)
     s.command[0] = command
     return command
@@ -179,7 +259,7 @@ def press(
 class Touch:
     """The law of one finger at a fixed `sample_time` (s), touching nothing at command 0.
 
-    >>> law = Touch(TouchParameters(), sample_time=1e-4, command_low=-22e-6, command_high=22e-6)
+    >>> law = Touch(TouchParameters(), elastic_constant=3.1e-3, sample_time=1e-4, command_low=-22e-6, command_high=22e-6)
     >>> law.step(1e-6, deflection=0.0, expected=0.0, max_force=1e-3) < 1e-6
     True
     """
@@ -187,12 +267,15 @@ class Touch:
     def __init__(
         self,
         parameters: TouchParameters,
+        elastic_constant: float,
         sample_time: float,
         command_low: float,
         command_high: float,
     ) -> None:
         self.parameters = parameters
-        self._coefficients = touch_coefficients(parameters, sample_time, command_low, command_high)
+        self._coefficients = touch_coefficients(
+            parameters, elastic_constant, sample_time, command_low, command_high
+        )
         self.state = touch_rest()
 
     def step(self, reference: float, deflection: float, expected: float, max_force: float) -> float:
@@ -208,8 +291,9 @@ class Touch:
         if not max_force >= 0.0:
             raise ValueError(f"max_force is {max_force!r} N, must be 0 or more")
         c, s = self._coefficients, self.state
-        feel(c, s, expected, deflection)
-        return press(c, s, reference, deflection, min(max_force, self.parameters.force_limit))
+        limit = min(max_force, self.parameters.force_limit)
+        feel(c, s, expected, deflection, limit)
+        return press(c, s, reference, deflection, limit)
 
     @property
     def push(self) -> float:

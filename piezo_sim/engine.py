@@ -267,7 +267,13 @@ def run_touching(
     sampled = cantilever.model(plant)
     finger = as_arrays(
         TouchingFinger(
-            touch_coefficients(touch, plant.sample_time, command.command_low, command.command_high),
+            touch_coefficients(
+                touch,
+                models.dynamics.elastic_constant,
+                plant.sample_time,
+                command.command_low,
+                command.command_high,
+            ),
             touch_rest(),
             inverse,
             sensorless_rest(inverse, degc),
@@ -599,8 +605,8 @@ def run_touching_samples(
     for n in range(len(inputs.reference)):
         look(plant, state, inputs.normal[n], inputs.uniform[n])
         deflection = state.readings[0]
-        feel(law, law_state, finger.expected[0], deflection)
         limit = finger.max_force[first + n]
+        feel(law, law_state, finger.expected[0], deflection, limit)
         command = press(law, law_state, inputs.reference[n], deflection, limit)
         warmth = models_state.body.degc[0] - REFERENCE_DEGC
         voltage = inverse_step(models, models_state, command, inputs.temperature[n], 1.0)

@@ -317,6 +317,10 @@ def test_a_commissioned_finger_is_exported_from_its_directory(export, tmp_path):
             ["--feedforward", "slow.yaml"],
             "for a resonance of 666.6 Hz and D(s) [5.7e-08, 8.1e-06, 1.0],",
         ),
+        (
+            ["--controller", "none", "--feedforward", "models.yaml"],
+            "models.yaml: 'compensator' is 'sensorless' and 'controller_file' is 'none'",
+        ),
         (["--controller", "nobody"], "controller 'nobody' is no file"),
         (["--name", "1st"], "the name is '1st', must be letters"),
         (["nothing.yaml"], "nothing.yaml: cannot be read"),
@@ -336,6 +340,7 @@ def test_what_should_not_run_is_refused_and_nothing_written(arguments, said, exp
     dump("servo.yaml", "servo", {"write": "next_edge"})
     dump("wrong.yaml", "servo", {"sensor_skale": 1.0})
     dump("slow.yaml", "feedforward", {"dynamics.denominator": [1e-7, 8.1e-6, 1.0]})
+    dump("models.yaml", "feedforward", {"compensator": "sensorless"})
     dump("weak.yaml", "feedforward", {"voltage_low": -10.0, "voltage_high": 10.0})
     dump(
         "tiny.yaml", "feedforward", {"hysteresis.weights": [1e-39], "hysteresis.thresholds": [0.0]}

@@ -9,6 +9,7 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 import yaml
@@ -129,6 +130,24 @@ def test_force_ends_closing_when_both_fingers_are_there_and_does_not_hinder_open
     assert decided(closing(), [2.0, 1.5], [10e-6, 5e-6], one).stalled  # and now at its end
     motion = Motion(DEFAULTS, Goal(40e-6, 1e-3, 20e-6), [5e-6, 5e-6])
     assert decided(motion, [1.5, 1.5], [5e-6, 5e-6], both) is None
+
+
+@pytest.mark.parametrize("period", [0.05, 0.1])
+@pytest.mark.parametrize("speed", [0.2e-6, 0.5e-6, 0.9e-6, 1.9e-6])
+@pytest.mark.parametrize("waypoints", [(), (Waypoint(20e-6, 0.0),)])
+def test_a_tip_that_moves_with_its_line_does_not_rest(period, speed, waypoints):
+    """Within the rest time it goes less than half a tolerance; both goals move a tip at `speed` (m/s)."""
+    waypoints = tuple(Waypoint(20e-6 / speed, w.opening) for w in waypoints)
+    goal_speed = DEFAULTS.speed_limit if waypoints else 2.0 * speed
+    motion = Motion(DEFAULTS, Goal(0.0, 1e-3, goal_speed, waypoints), [0.0, 0.0])
+    for finger in (0, 1):
+        motion.depart(finger, 0.0, 0.0)
+    for now in period * np.arange(1, 50):
+        places = [speed * now] * 2
+        assert motion.decide([now] * 2, places, [0.91e-3] * 2) is None
+    for now in period * np.arange(50, 80):  # and now they stand
+        outcome = motion.decide([now] * 2, places, [0.91e-3] * 2)
+    assert outcome and outcome.stalled
 
 
 def test_goal_takes_defaults_for_zero():

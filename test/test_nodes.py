@@ -24,15 +24,24 @@ from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
 
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
-from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE, SETPOINT
+from piezo_control.nodes.qos import FAULTS, FOLLOWED, LATCHED, SAMPLE, SETPOINT
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import read
 from piezo_control.touch import Touch, TouchParameters
-from piezo_gripper_msgs.msg import FingerState, Profile, RecorderState, Sample, SampleSeries
+from piezo_gripper_msgs.msg import (
+    Dynamics,
+    Fault,
+    FingerState,
+    Profile,
+    RecorderState,
+    Sample,
+    SampleSeries,
+)
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
@@ -217,8 +226,8 @@ def test_the_finger_tells_the_reference_that_is_followed(neighbour, tmp_path):
 
 def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neighbour, tmp_path):
     """An object at 1 µm: the tip stays there, and the models say where it would be."""
-    limit, away = 2e-4, 1e-6
-    law = Touch(TouchParameters(), 1e-4, -22e-6, 22e-6)
+    limit, away, elastic_constant = 2e-4, 1e-6, 1e-3
+    law = Touch(TouchParameters(), elastic_constant, 1e-4, -22e-6, 22e-6)
     rows = [(n, min(0.2e-6 * n, away), 0.2e-6 * n) for n in range(1, 10)]  # number, m, m
     commands = [law.step(10e-6, *row[1:], limit) for row in [(0, 0.0, 0.0), *rows]]
     with node("feedback", tmp_path, force_control=True):
@@ -232,7 +241,16 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
         expected = neighbour.publisher("expected", LATCHED)
         deflection = neighbour.publisher("deflection")
         said = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
-        neighbour.insist(deflection, sample(0, 0.0), lambda: answers)
+        neighbour.insist(
+            deflection,
+            sample(0, 0.0),
+            lambda: any("waits for '/dynamics'" in s.status[0].message for s in said),
+        )
+        assert not answers
+        told = neighbour.node.create_publisher(Dynamics, "dynamics", LATCHED)
+        tip = DynamicsParameters(elastic_constant=elastic_constant)
+        told.publish(Dynamics(denominator=tip.denominator, elastic_constant=elastic_constant))
+        neighbour.wait(lambda: answers)
         for number, value, unhindered in rows:
             if number == 1:  # asked again once that is known: it is not forgotten
                 expected.publish(sample(number, unhindered))
@@ -253,6 +271,15 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
     assert [a.value for a in answers[first - 1 :]] == commands
     assert all(a.by_controller for a in answers)
     assert (pushes[0].number, pushes[0].value) == (0, 0.0)
+
+
+def test_a_finger_that_would_swing_itself_up_is_not_answered(neighbour, tmp_path):
+    """100 Hz, by the file of its feedforward: a spectral radius above 1."""
+    with node("feedback", tmp_path, force_control=True):
+        faults = neighbour.listen(Fault, "fault", FAULTS)
+        told = neighbour.node.create_publisher(Dynamics, "dynamics", LATCHED)
+        told.publish(Dynamics(denominator=[2.5e-6, 5.4e-5, 1.0], elastic_constant=1e-3))
+        neighbour.wait(lambda: any("force control swings up on a finger" in f.text for f in faults))
 
 
 def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp_path):

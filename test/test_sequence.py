@@ -5,6 +5,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from piezo_control.profile import Profile, SampledSignal
 from piezo_control.sequence import FIRST, NEW, REPEATED, STRAY, Sequence
 
 strays = st.lists(st.integers(2, 2**64 - 1), max_size=3)
@@ -20,6 +21,17 @@ def test_strays_neither_count_nor_stop_the_count(between):
         assert sequence.classify(number) == (NEW if number else FIRST)
         sequence.count(number)
         assert sequence.classify(number) == REPEATED
+
+
+def test_a_number_that_no_float_holds_is_never_the_first_of_a_count():
+    """2^64 - 1 came first, the next block of a profile ran out of integers, and the node ended."""
+    sequence = Sequence(gaps=True)
+    wild = [2**64 - 4, 2**64 - 3, 2**64 - 2, 2**64 - 1]
+    assert [sequence.classify(n) for n in wild] == [STRAY] * 4
+    assert not any(sequence.begins_anew(n) for n in wild)
+    assert sequence.next == -1
+    assert sequence.classify(2**53) == NEW
+    SampledSignal(Profile([0.0, 1.0], [0.0, 1e-6], linear=True), 1e-4)[2**53]
 
 
 def test_zero_begins_again():

@@ -13,11 +13,14 @@ import yaml
 from rich.console import Console
 from test_servo import EXECUTABLES, PATIENT, TIMEOUT, wait
 
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.gripper import AT_LIMIT, GripperParameters
 from piezo_control.nodes import fingerctl
-from piezo_control.nodes.client import connect
+from piezo_control.nodes.client import ClientError, connect
+from piezo_control.nodes.parameters import ServoNodeParameters, check_force, read_feedforward
+from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.safety import FAULT, NORMAL
 from piezo_control.sensorless import SensorlessParameters
@@ -152,6 +155,70 @@ def test_a_finger_in_real_time_stops_at_a_wall(tmp_path):
         wait(lambda: servo.phase == NORMAL)
     finally:
         servo.stop()
+
+
+def test_the_force_is_told_by_the_elastic_constant_of_the_feedforwards_file(tmp_path):
+    """What `identify stiffness` writes; with the paper's one a finger of 1e-3 m/N pushes with 3.1 times the limit."""
+    stiff = DynamicsParameters(elastic_constant=1e-3)
+    felt = feeling_of(DEFAULTS, SensorlessParameters(dynamics=stiff), OPEN_LOOP, 22.0)
+    assert felt.touch.elastic_constant == 1e-3
+    run, push = run_touching(
+        CantileverParameters(contact=WALL, dynamics=stiff),
+        DEFAULTS,
+        SensorlessParameters(dynamics=stiff),
+        TemperatureParameters(),
+        Profile([0.1, 0.3], [0.0, 15e-6], linear=True),
+        Profile([0.0], [LIMIT]),
+        8000,
+    )
+    assert np.max(-run.total_force) < 1.1 * LIMIT
+    assert push[-1] == pytest.approx(LIMIT, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "values, said",
+    [
+        ({"dynamics": {"denominator": [5.7e-8, 8.1e-6, 1.0]}}, "'dynamics.elastic_constant' is missing"),
+        (
+            {"dynamics": {"elastic_constant": 1e-3, "denominator": [2.5e-6, 5.4e-5, 1.0]}},
+            r"swings up on a finger of 100\.7 Hz .* 'touch.position_rate' is 30.2",
+        ),
+    ],
+)  # fmt: skip
+def test_a_finger_whose_force_nobody_knows_or_that_swings_up_is_refused(values, said, tmp_path):
+    file = tmp_path / "feedforward.yaml"
+    file.write_text(yaml.safe_dump({"/**/feedforward": {"ros__parameters": values}}))
+    parameters = ServoNodeParameters(force_control=True, feedforward_file=str(file))
+    with pytest.raises(ParameterError, match=said):
+        check_force(parameters, read_feedforward(parameters), H)
+
+
+@contextmanager
+def servo_node(folder, **parameters):
+    words = [w for n, v in parameters.items() for w in ("-p", f"{n}:={v}")]
+    with (folder / "servo.log").open("wb") as log:
+        process = subprocess.Popen(
+            [EXECUTABLES / "servo", "--ros-args", *words], stdout=log, stderr=log
+        )
+        try:
+            with connect(TIMEOUT) as ros:
+                yield ros.finger("")
+        finally:
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(TIMEOUT) == 0
+
+
+def test_a_reset_without_a_temperature_moves_nothing(tmp_path):
+    """The cause persists: the finger went up by half its way at each reset, until it was seen again."""
+    feels = {"force_control": "true", "missed_limit": 10**6, "late_share": 1.0, "hold_time": 60.0}
+    lost = {"thermometer.fallback": "fault", "thermometer.timeout": 0.01}
+    with servo_node(tmp_path, **feels, **lost) as finger:
+        finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.FAULT)
+        with pytest.raises(ClientError, match="temperature missing: none for 0.01 s"):
+            finger.reset()
+        assert finger.state.times == 1
+    log = (tmp_path / "servo.log").read_text()
+    assert "with force control" in log and "robust" not in log
 
 
 @contextmanager

@@ -21,7 +21,12 @@ from pathlib import Path
 
 from piezo_control.export.firmware import firmware, write
 from piezo_control.feedback import FeedbackParameters, successor
-from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
+from piezo_control.nodes.parameters import (
+    ServoNodeParameters,
+    check_delay,
+    check_sensor,
+    read_feedforward,
+)
 from piezo_control.options import output_folder
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.servo.law import objections
@@ -60,6 +65,7 @@ def make(arguments: argparse.Namespace) -> dict[str, str]:
         )
     controller = successor(p.controller_file, FeedbackParameters())
     feedforward = read_feedforward(p)
+    check_sensor(controller, feedforward, p)
     if arguments.sample_time is not None and arguments.sample_time != controller.sample_time:
         raise ParameterError(
             f"--sample-time is {arguments.sample_time:g} s, controller '{controller.name}' was made for "

@@ -3,7 +3,7 @@
 
 in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m),
      reference_waveform (Waveform, m), expected (Sample, m) with `force_control`: the deflection of a tip that
-     nobody pushes
+     nobody pushes, dynamics (Dynamics) with that: how the tip gives way, by the feedforward's file
 out: command (Sample, m), reference_followed_profile (Profile, m), reference_followed_waveform (Waveform, m),
      push (Sample, N) with `force_control`: the force of an object, as estimated
 
@@ -30,6 +30,8 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from piezo_control.design.preview import asked
+from piezo_control.design.touching import check_stable
+from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import (
     Feedback,
     FeedbackParameters,
@@ -42,11 +44,11 @@ from piezo_control.nodes.block import BlockNode, command_range
 from piezo_control.nodes.parameters import FeedbackNodeParameters
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, SAMPLE
-from piezo_control.parameters import ParameterError, flatten
+from piezo_control.parameters import ParameterError, build, flatten
 from piezo_control.profile import SampledSignal
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
 from piezo_control.touch import Touch
-from piezo_gripper_msgs.msg import Sample
+from piezo_gripper_msgs.msg import Dynamics, Sample
 
 PUSH_PERIOD = 1e-2  # s, between two of the push
 
@@ -68,6 +70,9 @@ class FeedbackNode(BlockNode):
         self.expected = Sample()
         self._expected_at = -math.inf
         self._expectations: Subscription | None = None
+        self.touch: Touch | None = None  # before the tip's dynamics are known
+        self.dynamics: DynamicsParameters | None = None
+        self.create_subscription(Dynamics, "dynamics", self._on_dynamics, LATCHED)
         self._file = ""
         self._loading = False
         self._take_file()
@@ -88,6 +93,8 @@ class FeedbackNode(BlockNode):
 
     def check(self, parameters: FeedbackNodeParameters) -> None:
         """Refuse the half of a controller, and one that cannot take over where the loop is."""
+        if self.active:
+            self._touching(parameters)
         if parameters.controller_file not in ("", self.parameters.controller_file):
             controller = successor(parameters.controller_file, self.parameters)
             if self.active and controller.sample_time != parameters.sample_time:
@@ -134,9 +141,42 @@ class FeedbackNode(BlockNode):
         """Begin with the controller at rest."""
         p = self.parameters
         self.law = Feedback(p)
-        self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
+        self.touch = self._touching(p)
         self.rate = RateWatch(p.sample_time)
         self.armed = not self._has_a_rate()
+
+    def _touching(self, p: FeedbackNodeParameters) -> Touch | None:
+        """Return the law of a finger that feels; raise ParameterError for one that would swing itself up."""
+        tip = self.dynamics
+        if not p.force_control or tip is None:
+            return None
+        law = Touch(p.touch, tip.elastic_constant, p.sample_time, p.command_low, p.command_high)
+        check_stable(p.touch, tip, p.sample_time, p.delay_samples)
+        return law
+
+    def _on_dynamics(self, told: Dynamics) -> None:
+        """Take over how the tip gives way; what the finger feels meanwhile stays."""
+        values = {
+            "denominator": list(told.denominator),
+            "elastic_constant": told.elastic_constant,
+        }
+        self.dynamics = None
+        try:
+            self.dynamics = build(DynamicsParameters, values, self.resolve_topic_name("dynamics"))
+            self._feel_on()
+        except ParameterError as error:
+            self.touch = None
+            if self.active:
+                self.trip(str(error))
+            return
+        self.go_on()
+
+    def _feel_on(self) -> None:
+        """Let the law of a finger that feels be that of the parameters; its state stays."""
+        law = self._touching(self.parameters)
+        if self.touch and law:
+            law.state = self.touch.state
+        self.touch = law
 
     def _has_a_rate(self) -> bool:
         """Say whether the law is made for one sample time."""
@@ -180,9 +220,7 @@ class FeedbackNode(BlockNode):
             if law.parameters != self.law.parameters:
                 self._warn()
             self.law = law
-            state = self.touch.state
-            self.touch = Touch(p.touch, p.sample_time, p.command_low, p.command_high)
-            self.touch.state = state
+            self._feel_on()
             self._look_ahead()
 
     def _started(self, parameters: FeedbackNodeParameters) -> Feedback:
@@ -223,7 +261,8 @@ class FeedbackNode(BlockNode):
         p = self.parameters
         figures |= {"controller": p.name, "certified": p.certified, **command_range(p)}
         if p.force_control:
-            figures |= {"controller": "force control", "certified": False, "push": self.touch.push}
+            push = self.touch.push if self.touch else math.nan
+            figures |= {"controller": "force control", "certified": False, "push": push}
         return wrong, figures
 
     def _on_expected(self, expected: Sample) -> None:
@@ -244,9 +283,9 @@ class FeedbackNode(BlockNode):
             return ""
         if sample.number == 0:
             self.expected = Sample()
-        if self.expected.number == sample.number:
-            return ""
-        return self._expectation()
+        if self.touch is None:
+            return self._told_by("dynamics")
+        return "" if self.expected.number == sample.number else self._told_by("expected")
 
     def compute(self, sample: Sample, answer: Sample) -> bool:
         self.deflection = sample.value
@@ -259,29 +298,29 @@ class FeedbackNode(BlockNode):
         answer.by_controller = self._has_a_rate()
         if not p.force_control:
             answer.value = self.law.step(self.asked[sample.number], sample.value)
-        elif self._is_expected():
+        elif self._is_expected() and self.touch:
             answer.value = self.touch.step(
                 reference, sample.value, self.expected.value, self.reference.max_force
             )
-            self._tell_push(sample)
+            self._tell_push(sample, self.touch.push)
         else:
             return False
         answer.limited = is_limited(p, answer.value, reference, answer.by_controller)
         return True
 
-    def _tell_push(self, sample: Sample) -> None:
+    def _tell_push(self, sample: Sample, value: float) -> None:
         """Tell the push of the object, not at every sample."""
         if (
             self._pushes
             and sample.number % max(1, round(PUSH_PERIOD / self.parameters.sample_time)) == 0
         ):
             push = Sample(header=sample.header, number=sample.number, period=PUSH_PERIOD)
-            push.value = self.touch.push
+            push.value = value
             self._pushes.publish(push)
 
-    def _expectation(self) -> str:
-        """Return in words whose deflection is expected, and by whom."""
-        topic = self.resolve_topic_name("expected")
+    def _told_by(self, topic: str) -> str:
+        """Return in words which topic of the feedforward is missing."""
+        topic = self.resolve_topic_name(topic)
         return f"'{topic}': runs 'feedforward' with `compensator: sensorless`?"
 
     def _is_expected(self) -> bool:
@@ -292,9 +331,10 @@ class FeedbackNode(BlockNode):
         if self._expected_at == -math.inf:
             self._expected_at = now  # the feedforward is heard once it has a command
         age, limit = now - self._expected_at, self.parameters.age_limit
+        missing = "expected" if self.touch else "dynamics"
         if age > limit:
             self.trip(
-                f"no news for {age:.2g} s, must be within {limit:g} s, of {self._expectation()}"
+                f"no news for {age:.2g} s, must be within {limit:g} s, of {self._told_by(missing)}"
             )
         return age <= limit
 

@@ -5,7 +5,8 @@ in:  command (Sample, m), state (FingerState: the voltage that is applied when t
      temperature (sensor_msgs/Temperature, °C) with `compensator: sensorless`,
      deflection (Sample, m) with that and `adaptation.time_constant`
 out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator;
-     expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later
+     expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later,
+     dynamics (Dynamics) with that: what a feedback that feels has to know of the tip
 
 Running free, a command that stays away is held and then ramped to rest, `rest_voltage`, where
 it stays until `~/reset`. When the node is deactivated, shut down or stopped by a signal, the voltage ramps to
@@ -43,7 +44,7 @@ from piezo_control.safety import (
 from piezo_control.sensorless import Sensorless
 from piezo_control.sequence import grid_index
 from piezo_control.thermometer import Thermometer
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_gripper_msgs.msg import Dynamics, FingerState, Sample
 
 
 class FeedforwardNode(BlockNode):
@@ -57,6 +58,7 @@ class FeedforwardNode(BlockNode):
     def __init__(self) -> None:
         super().__init__()
         self.expectations = self.create_publisher(Sample, "expected", LATCHED)
+        self.dynamics = self.create_publisher(Dynamics, "dynamics", LATCHED)
         self.watchdog = self.create_steady_timer(RAMP_PERIOD, self._watch, autostart=False)
         self.moved = time.monotonic()
         self._told = -math.inf  # when `state` was heard
@@ -87,6 +89,10 @@ class FeedforwardNode(BlockNode):
         if self.parameters.compensator == "sensorless":
             self._temperature_input = TemperatureInput(self, self._on_temperature)
             self._deflection = Sample(value=math.nan)
+            tip = self.parameters.dynamics
+            told = Dynamics(denominator=tip.denominator, elastic_constant=tip.elastic_constant)
+            told.header.stamp = base.system_time()
+            self.dynamics.publish(told)
             if self.parameters.adaptation.time_constant:
                 self._deflection_input = self.create_subscription(
                     Sample, "deflection", self._on_deflection, SAMPLE

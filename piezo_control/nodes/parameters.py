@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from piezo_control.design.touching import check_stable
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.parameters import ParameterError, build, group, load, parameter
@@ -178,12 +179,43 @@ def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardNodeParamete
     )
 
 
+def check_force(
+    p: ServoNodeParameters, feedforward: FeedforwardNodeParameters, sample_time: float
+) -> None:
+    """Raise ParameterError for a finger whose force nobody could tell, or that would swing itself up."""
+    path = p.feedforward_file
+    if path and "dynamics.elastic_constant" not in load(path, "feedforward"):
+        raise ParameterError(
+            f"{path}: 'dynamics.elastic_constant' is missing, and with it what a deflection means in N: "
+            "`identify stiffness` measures it"
+        )
+    check_stable(p.touch, feedforward.dynamics, sample_time, loop_delay(p))
+
+
+def check_sensor(
+    controller: FeedbackParameters, feedforward: FeedforwardNodeParameters, p: ServoNodeParameters
+) -> None:
+    """Raise ParameterError for a finger that should go by its models alone, which no servo does."""
+    is_open = controller.controller == "none" and not p.force_control
+    if is_open and feedforward.compensator == "sensorless":
+        raise ParameterError(
+            f"{p.feedforward_file}: 'compensator' is 'sensorless' and 'controller_file' is '{p.controller_file}': "
+            "the models of vibration, creep and heat run in the node 'feedforward' alone; with 'inverse' the servo "
+            "undoes the hysteresis only"
+        )
+
+
+def loop_delay(p: ServoNodeParameters) -> int:
+    """Return the delay of the servo's loop in samples."""
+    return p.delay_samples + (p.write == "next_edge")
+
+
 def check_delay(controller: FeedbackParameters, p: ServoNodeParameters) -> None:
     """Raise ParameterError unless the controller was designed for the delay of the servo's loop.
 
     An open loop was designed for any, and a loop that feels has no controller.
     """
-    delay = p.delay_samples + (p.write == "next_edge")
+    delay = loop_delay(p)
     has_one = controller.controller != "none" and not p.force_control
     if has_one and controller.delay_samples != delay:
         raise ParameterError(

@@ -29,7 +29,13 @@ from piezo_control.feedback import FeedbackParameters, controller_file, is_limit
 from piezo_control.nodes import base
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.block import command_range
-from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
+from piezo_control.nodes.parameters import (
+    ServoNodeParameters,
+    check_delay,
+    check_force,
+    check_sensor,
+    read_feedforward,
+)
 from piezo_control.nodes.phases import PHASES
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import LATCHED, SAMPLE
@@ -110,6 +116,7 @@ class ServoNode(FingerNode):
                 f"{controller.sample_time:g} s, the loop runs at {self.servo.sample_time:g} s: deactivate "
                 f"'{self.NAME}' first"
             )
+        check_sensor(controller, self._feedforward, parameters)
         self.servo.check_controller(controller)
 
     def _controller(self, parameters: ServoNodeParameters) -> FeedbackParameters:
@@ -141,9 +148,11 @@ class ServoNode(FingerNode):
         controller = self._controller(p)
         check_delay(controller, p)
         feedforward = self._feedforward = read_feedforward(p)
+        check_sensor(controller, feedforward, p)
         self._object(controller)
         feeling = None
         if p.force_control:
+            check_force(p, feedforward, controller.sample_time)
             feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
@@ -178,9 +187,9 @@ class ServoNode(FingerNode):
         self.teller.timer_period_ns = round(p.state_period * 1e9)
         self.drain.timer_period_ns = round(p.block_period * 1e9)
         self.drain.reset()
+        law = "force control" if p.force_control else f"controller '{controller.name}'"
         self.get_logger().info(
-            f"loop at {1.0 / controller.sample_time:g} Hz on driver '{p.driver}' with controller "
-            f"'{controller.name}'"
+            f"loop at {1.0 / controller.sample_time:g} Hz on driver '{p.driver}' with {law}"
         )
         self._follow_phase()
 
@@ -194,9 +203,8 @@ class ServoNode(FingerNode):
 
     def _say_origins(self) -> None:
         p = self.parameters
-        self.comes_from(
-            "controller", controller_file(p.controller_file) if p.controller_file != "none" else ""
-        )
+        is_led = p.controller_file != "none" and not p.force_control
+        self.comes_from("controller", controller_file(p.controller_file) if is_led else "")
         self.comes_from("feedforward", p.feedforward_file)
 
     def stop(self) -> None:
@@ -232,6 +240,9 @@ class ServoNode(FingerNode):
                 self._say_origins()
 
     def reset(self) -> None:
+        if self._ends_without_temperature():
+            # It would move the finger until the fault comes back.
+            raise ValueError(f"{self.thermometer.wrong}, and 'thermometer.fallback' is 'fault'")
         if self.servo:
             self.servo.reset()
 
@@ -255,6 +266,7 @@ class ServoNode(FingerNode):
         for share in (0.5, 0.9, 0.99, 0.999):
             figures[f"late, {share:.1%} (us)"] = f"{lateness_quantile(lateness, share) * 1e6:.0f}"
         if self.parameters.force_control:
+            figures |= {"controller": "force control", "certified": False}
             figures |= {"push": s.push, "temperature": self.thermometer.degc}
         return self._wrong(s), figures
 
@@ -276,7 +288,7 @@ class ServoNode(FingerNode):
         complaint = self.thermometer.wrong
         servo.feel(self.thermometer.read(time.monotonic()))
         wrong = self.thermometer.wrong
-        if wrong and self.parameters.thermometer.fallback == "fault":
+        if self._ends_without_temperature():
             servo.give_up_without_temperature()
         if wrong == complaint:
             return
@@ -287,6 +299,13 @@ class ServoNode(FingerNode):
         else:
             self.get_logger().info(f"temperature is back: {self.thermometer.degc:g} °C")
         self.publish_diagnostics()
+
+    def _ends_without_temperature(self) -> bool:
+        """Say whether the temperature is missing to a finger that must not go on without it."""
+        is_needed = (
+            bool(self._temperature_input) and self.parameters.thermometer.fallback == "fault"
+        )
+        return is_needed and bool(self.thermometer.wrong)
 
     def _rate(self) -> float:
         """Return how many samples a second were served lately."""

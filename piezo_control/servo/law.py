@@ -262,7 +262,7 @@ def feeling_of(
 ) -> Feeling:
     """Return what feels for a finger at rest at `degc` (°C), with sample time and command range of `feedback`.
 
-    Raises ParameterError for models that have no inverse.
+    Raises ParameterError for models that have no inverse or no elastic constant.
     """
     h = feedback.sample_time
     # The models follow a voltage here, and never shape a reference.
@@ -270,7 +270,13 @@ def feeling_of(
     return Feeling(
         as_arrays(coefficients),
         as_arrays(sensorless_rest(coefficients, degc)),
-        touch_coefficients(touch, h, feedback.command_low, feedback.command_high),
+        touch_coefficients(
+            touch,
+            models.dynamics.elastic_constant,
+            h,
+            feedback.command_low,
+            feedback.command_high,
+        ),
         as_arrays(touch_rest()),
         expected=np.zeros(1),
         temperature=np.full(1, math.nan),
@@ -419,7 +425,7 @@ def touch(laws: Laws, w: Watch, wanted: int, reference: float, deflection: float
         command = modelled_deflection(laws.feedforward, laws.feedforward_state)
         touch_start(f.touch_state, command, deflection, f.expected[0])
         w.in_use[0] = wanted
-    feel(f.touch, f.touch_state, f.expected[0], deflection)
+    feel(f.touch, f.touch_state, f.expected[0], deflection, f.max_force[0])
     return press(f.touch, f.touch_state, reference, deflection, f.max_force[0])
 
 
