@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from packaging.requirements import Requirement
 from rclpy.serialization import deserialize_message, serialize_message
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -62,10 +63,9 @@ JAZZY_PACKAGES = {
     "xacro",
 }
 # ... and keys of rosdep/python.yaml that resolve on Ubuntu noble. There is no key for mcap, none for
-# numba that noble has a package for, and those for control and slycot do not begin with python3.
+# numba that noble has a package for, and that for control does not begin with python3.
 ROSDEP_KEYS = {
     "python-control-pip",
-    "python-slycot-pip",
     "python3-hypothesis",
     "python3-jinja2",
     "python3-matplotlib",
@@ -79,6 +79,7 @@ ROSDEP_KEYS = {
     "python3-scipy",
     "python3-yaml",
 }
+JAZZY_PINS = (ROOT / "requirements" / "jazzy.txt").read_text()
 
 
 def setup_keywords() -> dict[str, ast.expr]:
@@ -106,6 +107,17 @@ def test_one_version_everywhere():
 def test_dependencies_have_rosdep_keys(manifest):
     dependencies = {e.text for e in manifest if e.tag == "depend" or e.tag.endswith("_depend")}
     assert dependencies - JAZZY_PACKAGES - ROSDEP_KEYS - {"piezo_gripper_msgs"} == set()
+
+
+def test_what_rosdep_installs_by_pip_runs_with_the_numpy_of_jazzy():
+    keys = {e.text for e in MANIFEST if e.tag.endswith("_depend") and e.text.endswith("-pip")}
+    numpy = re.search(r"^numpy==(\S+)", JAZZY_PINS, re.MULTILINE)[1]
+    assert keys
+    for key in keys:
+        package = re.fullmatch(r"python3?-(.+)-pip", key)[1]
+        for requirement in map(Requirement, importlib.metadata.requires(package) or []):
+            if requirement.name == "numpy":
+                assert numpy in requirement.specifier, (package, requirement)
 
 
 def test_imported_ros_packages_are_declared():
