@@ -5,12 +5,24 @@ from __future__ import annotations
 
 import atexit
 import importlib
+import re
 import signal
+import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import requires
+from pathlib import Path
 from typing import Any
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+# What comes with another package, or is called otherwise there.
+PART_OF = {
+    "llvmlite": "numba",
+    "lz4": "rosbags",
+    "tornado": "bokeh",
+    "yaml": "pyyaml",
+    "zstandard": "rosbags",
+}
 LOOK_PERIOD = 0.02  # s, between two looks at whether a signal came
 
 
@@ -70,13 +82,34 @@ def stop_at_signals() -> Stop:
     return stop
 
 
+def how_to_get(package: str) -> str:
+    """Return in a few words how a Python package gets here that one of the programs imports."""
+    package = PART_OF.get(package, package)
+    declared = [re.split(r"[^\w.-]", line)[0].lower() for line in requires("piezo_gripper") or []]
+    if package in declared:
+        return f"needs {package}: pip install {package}"
+    return (
+        f"needs {package}: source the setup.bash of ROS 2 Jazzy and of the workspace, or that of a "
+        "checkout after 'make env'"
+    )
+
+
 def executable(module: str) -> Callable[[], int]:
-    """Return a function that imports `module` and runs its `main`."""
+    """Return a function that imports `module` and runs its `main`.
+
+    Where a package is missing it says in one line which, and how to get it, and ends with exit code 1.
+    """
 
     def start() -> int:
         # Nothing moves a finger yet; what does sets handlers of its own that bring it to rest.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        return importlib.import_module(module).main()
+        try:
+            return importlib.import_module(module).main()
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package in ("", "piezo_control", "piezo_sim"):
+                raise
+            sys.exit(f"{Path(sys.argv[0]).name}: {how_to_get(package)}")
 
     return start
 

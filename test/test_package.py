@@ -15,6 +15,8 @@ from ament_index_python.packages import get_package_prefix, get_package_share_di
 from packaging.requirements import Requirement
 from rclpy.serialization import deserialize_message, serialize_message
 
+from piezo_control import start
+
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
 MESSAGES_MANIFEST = ElementTree.parse(ROOT / "msg_defs" / "package.xml").getroot()
@@ -140,6 +142,74 @@ def test_executables_are_installed():
     installed = {path.name for path in folder.iterdir() if os.access(path, os.X_OK)}
     assert declared >= EXECUTABLES
     assert installed == declared
+
+
+def test_every_executable_begins_where_a_missing_package_is_told():
+    for script in importlib.metadata.entry_points(group="console_scripts"):
+        if script.dist.name == "piezo_gripper":
+            assert script.load().__qualname__ == start.executable("").__qualname__, script
+
+
+def test_every_imported_package_is_declared_or_of_ros():
+    sources = [p for d in ("piezo_control", "piezo_sim") for p in (ROOT / d).rglob("*.py")]
+    imported = {
+        name.split(".")[0]
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text()))
+        for name in (
+            [alias.name for alias in node.names] if isinstance(node, ast.Import)
+            else [node.module] if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    } - sys.stdlib_module_names - {"piezo_control", "piezo_sim"}  # fmt: skip
+    assert {"bokeh", "llvmlite", "numba", "rclpy", "slycot", "yaml"} <= imported
+    for name in imported:
+        of_ros = name in JAZZY_PACKAGES | {"piezo_gripper_msgs"}
+        assert ("source the setup.bash" in start.how_to_get(name)) == of_ros, name
+
+
+@pytest.mark.parametrize(
+    "executable, absent, said",
+    [
+        ("servo", "numba", "needs numba: pip install numba"),
+        ("servo", "llvmlite", "needs numba: pip install numba"),
+        ("commission", "numba", "needs numba: pip install numba"),
+        ("udp_finger", "numba", "needs numba: pip install numba"),
+        ("panel", "tornado", "needs bokeh: pip install bokeh"),
+        ("cantilever", "rosgraph_msgs", "needs rosgraph_msgs: source the setup.bash of ROS 2"),
+        ("fingerctl", "rclpy", "needs rclpy: source the setup.bash of ROS 2"),
+    ],
+)
+def test_a_missing_package_is_named_with_how_to_get_it(executable, absent, said):
+    done = without(absent, executable, "--help")
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"{executable}: {said}")
+    assert done.stderr.count("\n") == 1
+
+
+def test_firmware_is_exported_without_a_compiler_of_python(tmp_path):
+    done = without("numba", "export", "--out", str(tmp_path / "firmware"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "firmware" / "finger.c").exists()
+
+
+def without(absent, executable, *arguments):
+    """Run an executable where a package is not installed."""
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name=executable)
+    blocked = f"""
+import importlib.abc, sys
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name.split(".")[0] == {absent!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+sys.argv[0] = {executable!r}
+from {script.module} import {script.attr}
+sys.exit({script.attr}())
+"""
+    return subprocess.run(
+        [sys.executable, "-c", blocked, *arguments], capture_output=True, text=True, timeout=300
+    )
 
 
 @pytest.mark.parametrize(
