@@ -6,7 +6,6 @@ import http.client
 import math
 import os
 import re
-import shutil
 import signal
 import subprocess
 import time
@@ -17,6 +16,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from ament_index_python.packages import get_package_prefix
+
+pytest.importorskip("bokeh")
+
 from bokeh.events import ButtonClick
 
 from piezo_control.nodes import panel as panel_node
@@ -33,11 +35,6 @@ from piezo_gripper_msgs.msg import FingerState, Sample
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 180.0  # s, generous: the tests wait on conditions
-CHROMIUM = shutil.which("chromium")
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 
 
 # --- without a browser --------------------------------------------------------------------------------
@@ -247,17 +244,6 @@ def test_what_a_panel_does_again_and_again_goes_on_after_something_went_wrong(ca
 
 
 # --- in a browser -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no chromium on this machine (apt install chromium)")
-    playwright = pytest.importorskip("playwright.sync_api", reason="installed where chromium is")
-    with playwright.sync_playwright() as p:
-        chromium = p.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        yield chromium
-        chromium.close()
 
 
 class Page:

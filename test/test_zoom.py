@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_panel import browser
 
 from piezo_sim.experiment import zoom
 from piezo_sim.experiment.report import Section, write_html
 
-__all__ = ["browser"]  # a fixture of the module above
 needs_bokeh = pytest.mark.skipif(not zoom.HAS_BOKEH, reason="Bokeh is not installed")
 
 
