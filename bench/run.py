@@ -29,7 +29,8 @@ from rich.console import Console
 from piezo_control.hysteresis import Hysteresis, HysteresisParameters
 from piezo_control.identification.hysteresis import equal_thresholds, identify_hysteresis
 from piezo_control.identification.measurement import Measurement
-from piezo_sim.experiment.report import Section, print_table, write_html
+from piezo_control.report.page import Section, print_table, write_html
+from piezo_sim.experiment.plots import save
 
 matplotlib.use("Agg")
 
@@ -69,7 +70,7 @@ def synthesis(folder: Path) -> list[dict[str, Any]]:
 
 def draw(histograms: dict[str, np.ndarray], path: Path) -> Path:
     """Draw the distribution of the free-running periods around the sample time."""
-    figure, axis = plt.subplots(figsize=(7, 3.6))
+    figure, axis = plt.subplots(figsize=(7, 3.6), layout="constrained")
     for label, periods in histograms.items():
         rate = 1.0 / np.median(periods)
         deviation = np.clip(periods * rate - 1.0, -0.3, 0.3) * 100
@@ -78,9 +79,7 @@ def draw(histograms: dict[str, np.ndarray], path: Path) -> Path:
         axis.axvline(edge, color="k", ls=":", lw=0.9)
     axis.set(xlabel="period, deviation from the sample time [%]", ylabel="periods")
     axis.legend()
-    figure.savefig(path, dpi=110, bbox_inches="tight")
-    plt.close(figure)
-    return path
+    return save(figure, path)
 
 
 def measure(folder: Path, histograms: dict[str, np.ndarray]) -> Iterator[list[dict[str, Any]]]:

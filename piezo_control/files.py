@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -27,6 +28,37 @@ def replaced(*paths: Path) -> Iterator[list[Path]]:
     finally:
         for place in written:
             place.unlink(missing_ok=True)
+
+
+def why_not(text: str, is_folder: bool) -> str:
+    """Say why nothing can be written to a path, a folder or a file; empty: nothing speaks against it yet."""
+    if not text:
+        return "is empty"
+    if any(ord(letter) < ord(" ") for letter in text):
+        return "holds a control character"
+    kind, other = ("folder", "file") if is_folder else ("file", "folder")
+    try:
+        path = Path.cwd() / text
+    except FileNotFoundError:
+        return "is below the working directory, which is gone"
+    try:
+        place = next(place for place in (path, *path.parents) if place.exists())
+        if place != path and not place.is_dir():
+            return f"is below {place}, which is no folder"
+        if place == path and not (path.is_dir() if is_folder else path.is_file()):
+            return (
+                f"is a {other}; name a {kind}"
+                if path.is_dir() or path.is_file()
+                else f"is no {kind}"
+            )
+        home = place if place.is_dir() else place.parent
+        if max(len(os.fsencode(part)) for part in path.parts) > os.pathconf(home, "PC_NAME_MAX"):
+            return os.strerror(errno.ENAMETOOLONG)
+        if not os.access(home, os.W_OK | os.X_OK):
+            return f"cannot be written: {home}: {os.strerror(errno.EACCES)}"
+    except OSError as error:
+        return f"cannot be written: {error.strerror}"
+    return ""
 
 
 def write_json(path: Path, content: Any) -> Path:

@@ -23,6 +23,13 @@ exact with r'_i growing by w_0 b |du/dt|; this needs gaps r_{i+1} - r_i that nev
 It is stable, too, while b/T |1 - w_0/W_i| < 1 at the sample time T.
 The states must belong to a history: abs(z_{i+1} - z_i) <= r_{i+1} - r_i.
 
+With all plays at 0 the first rise from rest is half a loop (Masing's rule), whatever the weights are. A
+virgin share v bends it and leaves every loop as it is: of each weight w_i, i >= 1, the part 1 - v has its
+play at 0 and v/2 each at r_i and -r_i, which join at 2 r_i and at once. The first fall is the same curve
+downward. Once the voltage has been to both ends all three are one play again, and nothing is left of it.
+The parts are no history of one another, so the analytic inverse begins at 0; :func:`operator_inverse`
+takes any states.
+
 Sources: H. Janocha, K. Kuhnen, Sensors and Actuators A 79 (2000) 83 (inverse); K. Kuhnen, European
 Journal of Control 9 (2003) 407 (modified); M. Al Janaideh, P. Krejci, IEEE/ASME Transactions on
 Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
@@ -31,6 +38,7 @@ Mechatronics 18 (2013) 1498 (rate-dependent thresholds).
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -82,6 +90,12 @@ class HysteresisParameters:
     rate_coefficient: float = parameter(
         0.0, "growth b of the thresholds r_1 ... r_n with abs(du/dt)", unit="s", low=0.0
     )
+    virgin_share: float = parameter(
+        0.0,
+        "part of w_1 ... w_n whose plays rest at both r_i and -r_i before the first rise; 0: all at 0",
+        low=0.0,
+        high=1.0,
+    )
 
     def __post_init__(self) -> None:
         if not self.thresholds or self.thresholds[0] != 0.0:
@@ -122,6 +136,7 @@ class Coefficients(NamedTuple):
     upper_weights: Sequence[float]
     lower_thresholds: Sequence[float]
     lower_weights: Sequence[float]
+    rest: Sequence[float]  # plays of an actuator that has not moved yet
 
 
 class State(NamedTuple):
@@ -146,7 +161,27 @@ def coefficients(parameters: HysteresisParameters, sample_time: float) -> Coeffi
         list(parameters.upper_weights),
         list(parameters.lower_thresholds),
         list(parameters.lower_weights),
+        [0.0] * len(parameters.weights),
     )
+
+
+def from_rest(parameters: HysteresisParameters, sample_time: float) -> Coefficients:
+    """Return the operator with the virgin share's plays as plays of their own; otherwise as :func:`coefficients`."""
+    c = coefficients(parameters, sample_time)
+    share = parameters.virgin_share
+    if share == 0.0:
+        return c
+    parts = ((1.0 - share, 0.0), (0.5 * share, 1.0), (0.5 * share, -1.0))
+    return c._replace(
+        thresholds=[0.0, *(r for r in c.thresholds[1:] for _ in parts)],
+        weights=[c.weights[0], *(part * w for w in c.weights[1:] for part, _ in parts)],
+        rest=[0.0, *(place * r for r in c.thresholds[1:] for _, place in parts)],
+    )
+
+
+def at_rest(operator: Coefficients) -> State:
+    """Return the state at 0 V of an actuator that has not moved yet."""
+    return State(list(operator.rest), voltage=[0.0], voltage_step=[0.0])
 
 
 def invert(operator: Coefficients) -> Coefficients:
@@ -173,6 +208,7 @@ def invert(operator: Coefficients) -> Coefficients:
         first * operator.dilation,
         *_invert_side(1.0, operator.upper_thresholds, operator.upper_weights),
         *_invert_side(1.0, operator.lower_thresholds, operator.lower_weights),
+        [0.0] * len(operator.weights),
     )
 
 
@@ -274,9 +310,9 @@ def operator_inverse(
     """Return the voltage u (V) at which scale H(u) + line u is `value` (m); nothing moves yet.
 
     Solved on the operator's own plays, so that `scale` and `line` (m/V) may change from sample to sample
-    where the inverse's plays would have to be mapped. From the last voltage on, the plays join in their
-    order, each adding its weight to the slope. Every slope scale W_i + line must be positive; for the
-    classical operator with constant thresholds.
+    where the inverse's plays would have to be mapped. From the last voltage on, each play adds its weight to
+    the slope where it joins; in which order, the states say. Every slope scale W_i + line must be positive;
+    for the classical operator with constant thresholds.
     """
     thresholds, weights, plays = operator.thresholds, operator.weights, s.plays
     voltage = s.voltage[0]
@@ -284,16 +320,22 @@ def operator_inverse(
     for i in range(len(weights)):
         reached += scale * weights[i] * plays[i]
     direction = 1.0 if value >= reached else -1.0
-    slope = scale * weights[0] + line
-    for i in range(1, len(weights)):
-        joins = plays[i] + direction * thresholds[i]
-        there = reached + slope * (joins - voltage)
-        if direction * (value - there) <= 0.0:
-            break
-        reached = there
-        voltage = joins
-        slope += scale * weights[i]
-    return voltage + (value - reached) / slope
+    while True:
+        slope = scale * weights[0] + line
+        ahead = math.inf
+        following = voltage
+        for i in range(1, len(weights)):
+            joins = plays[i] + direction * thresholds[i]
+            distance = direction * (joins - voltage)
+            if distance <= 0.0:
+                slope += scale * weights[i]
+            elif distance < ahead:
+                ahead = distance
+                following = joins
+        if not direction * (value - reached) > slope * ahead:
+            return voltage + (value - reached) / slope
+        reached += slope * (following - voltage)
+        voltage = following
 
 
 def inverse_voltage(inverse: Coefficients, s: State, deflection: float) -> float:
@@ -326,7 +368,7 @@ def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[fl
     back to where it was homed; one whose range is the same on both sides arrives at the same ends from there.
     Beyond them the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
     """
-    state = State([0.0] * len(operator.weights), voltage=[0.0], voltage_step=[0.0])
+    state = at_rest(operator)
     # Each voltage twice: at rest, thresholds that depend on the rate are the plain ones.
     ends = [operator_step(operator, state, voltage) for voltage in 2 * (low, low, high, high)]
     return ends[5], ends[7]
@@ -462,11 +504,11 @@ def play_history(
 def deflection_history(
     parameters: HysteresisParameters, voltage: ArrayLike, sample_time: float = 1.0
 ) -> NDArray[np.float64]:
-    """Return the deflections (m) of a homed actuator under a long voltage history (V, 1-D).
+    """Return the deflections (m) of an actuator under a long voltage history (V, 1-D) from rest.
 
-    The same as ``Hysteresis(parameters, sample_time)(voltage)``, computed play by play at once.
+    Without a virgin share the same as ``Hysteresis(parameters, sample_time)(voltage)``, computed play by play at once.
     """
-    c = coefficients(parameters, sample_time)
+    c = from_rest(parameters, sample_time)
     c = Coefficients(*(np.array(entry) for entry in c))
     voltage = np.asarray(voltage, float)
     thresholds = c.thresholds
@@ -474,4 +516,4 @@ def deflection_history(
         voltage_step = np.abs(np.diff(voltage, prepend=0.0))
         growth = c.dilation * np.concatenate(([0.0], voltage_step[:-1]))
         thresholds = thresholds + growth[:, None] * (np.arange(len(thresholds)) > 0)
-    return _dead_zones_of(c, play_history(thresholds, voltage) @ c.weights)
+    return _dead_zones_of(c, play_history(thresholds, voltage, c.rest) @ c.weights)

@@ -53,7 +53,8 @@ from piezo_control.hysteresis import (
     Coefficients,
     HysteresisParameters,
     State,
-    coefficients,
+    at_rest,
+    from_rest,
     operator_inverse,
     operator_step,
 )
@@ -66,6 +67,7 @@ from piezo_control.thermal import (
     Thermal,
     ThermalParameters,
     heated,
+    heated_operator,
     thermal_deflection,
     warm,
 )
@@ -143,8 +145,7 @@ def sensorless_coefficients(
             "'hysteresis' has dead zones or rate-dependent thresholds: the sensorless inverse is for the "
             "classical operator, `identify hysteresis` without them"
         )
-    operator = coefficients(h, sample_time)
-    slopes = list(accumulate(operator.weights))
+    slopes = list(accumulate(h.weights))
     for degc in (p.temperature_low, p.temperature_high):
         # Between the two the slopes of the inverse are on straight lines but for a positive factor.
         warmth = degc - REFERENCE_DEGC
@@ -157,7 +158,7 @@ def sensorless_coefficients(
             )
     times, shares = np.array(p.creep.times), np.array(p.creep.shares)
     return SensorlessCoefficients(
-        operator=operator,
+        operator=from_rest(h, sample_time),
         creep=creep.discretize(p.creep.gain, p.creep.gain_per_degc, times, shares, sample_time),
         thermal=thermal.discretize(p.thermal, slopes[-1], sample_time),
         taps=list(shaping.shaper(p.shaping, p.dynamics.denominator, sample_time)),
@@ -174,7 +175,7 @@ def sensorless_coefficients(
 def sensorless_rest(c: SensorlessCoefficients, temperature_degc: float) -> SensorlessState:
     """Return the state of a homed finger at its rest voltage, in equilibrium with `temperature_degc`."""
     start = min(max(temperature_degc, c.coldest), c.warmest)
-    hysteresis = State([0.0] * len(c.operator.weights), voltage=[0.0], voltage_step=[0.0])
+    hysteresis = at_rest(c.operator)
     home = operator_step(c.operator, hysteresis, c.rest)
     return SensorlessState(
         hysteresis=hysteresis,
@@ -210,17 +211,11 @@ def sensorless_step(
     for i in range(len(s.relaxations)):
         left += c.creep.retained[i] * s.relaxations[i]
         released += c.creep.released[i]
-    stroke = 1.0 + c.thermal.gain_per_degc * warmth
-    softening = c.thermal.lag_per_degc * warmth
     released *= max(0.0, c.creep.gain + c.creep.gain_per_degc * warmth)
     rest = wanted - thermal_deflection(c.thermal, s.body) - s.adapted.offset[0]
-    ideal = operator_inverse(
-        c.operator,
-        s.hysteresis,
-        rest / s.adapted.gain[0] - left,
-        stroke * (1.0 + softening),
-        released - stroke * softening * c.thermal.slope,
-    )
+    scale, line = heated_operator(c.thermal, warmth)
+    value = rest / s.adapted.gain[0] - left
+    ideal = operator_inverse(c.operator, s.hysteresis, value, scale, released + line)
     return apply(c, s, ideal, warmth, share)
 
 
@@ -231,10 +226,16 @@ def inverse_step(
     temperature_degc: float,
     share: float,
 ) -> float:
-    """Return the voltage (V) for a controller's command (m): the inverse hysteresis; the models follow."""
+    """Return the voltage (V) for a controller's command (m): the inverse hysteresis; the models follow.
+
+    It is that of the body's temperature and of the adapted gain, so that the controller meets the same finger at
+    any temperature. Creep and thermal deflection are left to the controller.
+    """
     warmth = s.body.degc[0] - REFERENCE_DEGC
     heat(c, s, temperature_degc)
-    ideal = operator_inverse(c.operator, s.hysteresis, command + s.offset[0], 1.0, 0.0)
+    scale, line = heated_operator(c.thermal, warmth)
+    value = (command + s.offset[0]) / s.adapted.gain[0]
+    ideal = operator_inverse(c.operator, s.hysteresis, value, scale, line)
     return apply(c, s, ideal, warmth, share)
 
 
@@ -266,7 +267,7 @@ def note(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: 
 
 def actuated(c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float) -> float:
     """Return what hysteresis and creep (m) are expected to give at the end of a sample at `voltage` (V)."""
-    total = heated(c.thermal, static(c, s), voltage, warmth)
+    total = hysteretic(c, s, voltage, warmth)
     for i in range(len(s.relaxations)):
         total += s.relaxations[i]
     return total
@@ -301,12 +302,14 @@ def take_over(s: SensorlessState, predicted: float, reference: float) -> None:
     s.offset[0] = predicted - reference
 
 
-def static(c: SensorlessCoefficients, s: SensorlessState) -> float:
-    """Return the deflection (m) of the hysteresis at 22 °C."""
+def hysteretic(
+    c: SensorlessCoefficients, s: SensorlessState, voltage: float, warmth: float
+) -> float:
+    """Return the deflection (m) of the hysteresis alone, `warmth` (°C) above 22 °C."""
     total = 0.0
     for i in range(len(c.operator.weights)):
         total += c.operator.weights[i] * s.hysteresis.plays[i]
-    return total
+    return heated(c.thermal, total, voltage, warmth)
 
 
 FROM_REST, BY_REFERENCE, BY_CONTROLLER = range(3)
@@ -328,7 +331,8 @@ class Sensorless:
         self.coefficients = sensorless_coefficients(parameters, sample_time)
         self.sample_time = sample_time
         self.state = sensorless_rest(self.coefficients, temperature_degc)
-        self.predicted = static(self.coefficients, self.state)
+        start = self.state.body.degc[0] - REFERENCE_DEGC
+        self.predicted = expected(self.coefficients, self.state, self.voltage, start)
         """Static deflection (m) that the models expect at the end of the last sample."""
         self._led = FROM_REST
 
@@ -366,10 +370,11 @@ class Sensorless:
         s = self.state
         if not math.isnan(deflection):
             adapt(self.coefficients.adaptation, s.adapted, deflection)
-        if self._led == BY_REFERENCE:
-            s.offset[0] = static(self.coefficients, s) - command
-        self._led = BY_CONTROLLER
         warmth = s.body.degc[0] - REFERENCE_DEGC
+        if self._led == BY_REFERENCE:
+            reached = hysteretic(self.coefficients, s, self.voltage, warmth)
+            s.offset[0] = s.adapted.gain[0] * reached - command
+        self._led = BY_CONTROLLER
         voltage = inverse_step(self.coefficients, s, command, temperature_degc, share)
         self._predict(voltage, warmth)
         return voltage

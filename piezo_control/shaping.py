@@ -18,6 +18,14 @@ resonance and sample time.
 No tap is negative: a shaped step rises without turning back, so that it leaves no minor loop behind in the
 hysteresis (with taps of either sign it could be a fifth shorter, on a finger without hysteresis).
 
+A profile that is known ahead is sent by the shaper's delay d too early, and with what the shaper rounds off once
+more on top (one step of van Cittert's iteration; h for the held sample): with t' = t + d + h
+
+    r'(t) = r(t') + (r(t') - sum_j a_j r(t' + d - j h)).
+
+It is a reference as any other, so no vibration comes with it; the tip misses the profile by (1 - A)² r, where it did
+by (1 - A) r.
+
 Sources: N. Singer, W. Seering, ASME J. Dynamic Systems, Measurement, and Control 112 (1990) 76 (zero
 vibration, robust); W. Singhose et al., IEEE ICRA (1995) 3112 (bounded residual); M. Rakotondrabe, C. Clévy,
 P. Lutz, IEEE T-ASE 7 (2010) 440 (on piezocantilevers).
@@ -36,6 +44,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linprog
 
 from piezo_control.parameters import ParameterError, parameter
+from piezo_control.profile import Profile, Signal
 
 LONGEST = 1000  # samples, a period of 10 Hz at 10 kHz: each tap costs the loop time in every sample
 DIRECTIONS = 48  # of the polygon that stands for the circle |V| <= bound
@@ -106,6 +115,15 @@ def residual_vibration(
 def delay(taps: Sequence[float], sample_time: float, ratio: float = 1.0) -> float:
     """Return the time (s) by which a shaped ramp comes late, for whoever plans ahead; `ratio` as in :func:`shape`."""
     return sample_time / ratio * sum(j * tap for j, tap in enumerate(taps))
+
+
+def ahead(signal: Signal, begin: float, end: float, taps: Sequence[float], h: float) -> Profile:
+    """Return what to ask for the tip to be at `signal` from `begin` to `end` (s), sample by sample of `h` (s)."""
+    lead = delay(taps, h) + h
+    span = len(taps) * h
+    time = h * np.arange(math.floor((begin - lead - span) / h), math.ceil((end + span) / h) + 1)
+    rounded = sum(tap * signal.at(time + 2.0 * lead - (j + 1) * h) for j, tap in enumerate(taps))
+    return Profile(time, 2.0 * signal.at(time + lead) - rounded, linear=True)
 
 
 def longest(taps: Sequence[float], ratio: float) -> int:

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import requires
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
@@ -97,19 +98,25 @@ def how_to_get(package: str) -> str:
 def executable(module: str) -> Callable[[], int]:
     """Return a function that imports `module` and runs its `main`.
 
-    Where a package is missing it says in one line which, and how to get it, and ends with exit code 1.
+    What is missing or what the machine refuses, a package or a full disk, is said in a line, with exit code 1; letters that
+    the terminal does not have, such as µ, stand there as '?'.
     """
 
     def start() -> int:
         # Nothing moves a finger yet; what does sets handlers of its own that bring it to rest.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+        if isinstance(sys.stdout, TextIOWrapper):
+            sys.stdout.reconfigure(errors="replace")
         try:
             return importlib.import_module(module).main()
         except ModuleNotFoundError as error:
             package = (error.name or "").partition(".")[0]
             if package in ("", "piezo_control", "piezo_sim"):
                 raise
-            sys.exit(f"{Path(sys.argv[0]).name}: {how_to_get(package)}")
+            print(f"{Path(sys.argv[0]).name}: {how_to_get(package)}", file=sys.stderr)
+        except OSError as error:
+            print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+        return 1
 
     return start
 

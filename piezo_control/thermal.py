@@ -69,9 +69,15 @@ def discretize(parameters: ThermalParameters, slope: float, sample_time: float) 
 
 def heated(thermal: Thermal, deflection: float, voltage: float, warmth: float) -> float:
     """Return H_s(U, theta) for the `deflection` H_s(U) (m) and `warmth` = theta - 22 °C."""
-    lag = thermal.slope * voltage - deflection
-    change = thermal.stroke * (1.0 + thermal.gain_per_degc * warmth)
-    return change * (deflection - thermal.lag_per_degc * warmth * lag)
+    scale, line = heated_operator(thermal, warmth)
+    return scale * deflection + line * voltage
+
+
+def heated_operator(thermal: Thermal, warmth: float) -> tuple[float, float]:
+    """Return what H_s(U, theta) is made of: scale H_s(U) + line U (m/V), with `warmth` = theta - 22 °C."""
+    stroke = thermal.stroke * (1.0 + thermal.gain_per_degc * warmth)
+    widening = thermal.lag_per_degc * warmth
+    return stroke * (1.0 + widening), -stroke * widening * thermal.slope
 
 
 def warm(thermal: Thermal, body: Body, surface_degc: float) -> None:

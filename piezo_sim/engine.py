@@ -204,8 +204,12 @@ def run(
         every,
         compiled,
     )
+    return _told(made, reference, feedback, feedback.controller != "none")
+
+
+def _told(made: Run, reference: Profile, feedback: FeedbackParameters, by_controller: Any) -> Run:
+    """Put in a run what was asked for, whatever was known ahead of it, and where a command was held at its end."""
     made = replace(made, reference=reference.at(made.time))
-    by_controller = feedback.controller != "none"
     held = is_limited(feedback, made.command, made.reference, by_controller)
     return replace(made, limited=np.maximum(made.limited, held))
 
@@ -290,14 +294,20 @@ def run_led(
     reference: Profile,
     led: int,
     samples: int,
+    tip_force: Profile | None = None,
     every: int = 1,
     compiled: bool | None = None,
 ) -> tuple[Run, SensorlessState]:
     """Run a finger led by a controller for `led` samples, then by its models; return it and their state.
 
     As long as there is a sensor, gain and offset of the models adapt, where their parameters say so. Other
-    parameters as in :func:`run`. Raises ParameterError when the models have no inverse.
+    parameters as in :func:`run`. Raises ParameterError when the models have no inverse, or what the controller
+    knows ahead (`preview_band`) would lead the models.
     """
+    if feedback.preview_band and led < samples:
+        raise ParameterError(
+            f"'preview_band' is {feedback.preview_band:g} Hz, must be 0 where the sensor is taken away"
+        )
     degc = temperatures_of(temperatures, plant.sample_time, 1)[0]
     inverse = sensorless_coefficients(models, plant.sample_time)
     sampled = cantilever.model(plant)
@@ -315,9 +325,10 @@ def run_led(
     )
     clipped = finger.models_state.clipped
     got = _run(
-        run_led_samples, finger, clipped, plant, temperatures, reference, samples, None, every, compiled,
+        run_led_samples, finger, clipped, plant, temperatures, asked(reference, feedback), samples, tip_force,
+        every, compiled,
     )  # fmt: skip
-    return got, finger.models_state
+    return _told(got, reference, feedback, got.number < led), finger.models_state
 
 
 def temperatures_of(

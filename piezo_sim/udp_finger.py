@@ -16,7 +16,6 @@ import struct
 import sys
 import threading
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from numba import types
 
 from piezo_control.compiled import compiled
 from piezo_control.files import write_json
-from piezo_control.options import port, within
+from piezo_control.options import output_file, port, within
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
 from piezo_control.servo.clock import Clock, become_real_time, clock_of, now
@@ -197,7 +196,9 @@ def main() -> int:
         help="UDP port, 0: any that is free (%(default)s)",
     )  # fmt: skip
     parser.add_argument("--cantilever", metavar="FILE", help="parameter file of a cantilever")
-    parser.add_argument("--report", metavar="FILE", help="where to write what was seen, as JSON")
+    parser.add_argument(
+        "--report", type=output_file, metavar="FILE", help="where to write what was seen, as JSON"
+    )
     parser.add_argument(
         "--priority",
         type=within(int, 0, 99),
@@ -237,7 +238,7 @@ def main() -> int:
     print(json.dumps(report))
     if arguments.report:
         try:
-            write_json(Path(arguments.report), report)
+            write_json(arguments.report, report)
         except OSError as error:
             print(f"udp_finger: --report {arguments.report}: {error.strerror}", file=sys.stderr)
             return 1

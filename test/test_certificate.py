@@ -185,8 +185,12 @@ def test_fast_meets_everything_at_once():
 
 
 @pytest.mark.parametrize(
-    "name", [FAST, "robust", "robust_delay_2", "robust_delay_3", "pid", "integrator_notch"]
-)
+    "name",
+    [
+        FAST, "robust", "robust_delay_2", "robust_delay_3", "pid", "integrator_notch",
+        "following", "following_adapted",
+    ],
+)  # fmt: skip
 def test_shipped_controllers_say_what_the_certificate_says(name):
     controller = shipped(name)
     gamma = synthesize(problem(name)).gamma if name == "fast" else math.nan

@@ -5,11 +5,15 @@ What takes long and lies behind the reading of the command line is left out here
 """
 
 import contextlib
+import errno
 import functools
+import importlib
 import io
 import itertools
+import os
 import re
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -18,8 +22,10 @@ from hypothesis import strategies as st
 
 pytest.importorskip("numba")  # `commission` and `udp_finger` import it
 
+from piezo_control import start
 from piezo_control.design import cli as design
 from piezo_control.design.problem import SynthesisError
+from piezo_control.export import cli as export
 from piezo_control.identification import cli as identification
 from piezo_control.nodes import fingerctl
 from piezo_control.parameters import ParameterError
@@ -132,6 +138,84 @@ def test_what_no_finger_stands_is_refused_before_it_moves(files, option, value, 
     code, said, _ = run(commission.main, [f"{option}={value}", "--yes"])
     assert code == 2
     assert allowed in said and value.removesuffix("e9") in said, said
+
+
+PROBLEM = str(params_folder() / "synthesis_robust.yaml")
+
+
+@pytest.mark.parametrize(
+    "main, words",
+    [
+        (experiment.main, ["step", "--out"]),
+        (experiment.main, ["analyse", "short.csv", "--out"]),
+        (identification.main, ["hysteresis", "short.csv", "--out"]),
+        (design.main, [PROBLEM, "--out"]),
+        (design.main, [PROBLEM, "--report"]),
+        (export.main, ["--out"]),
+        (monte_carlo.main, ["robust", "--out"]),
+        (commission.main, ["--yes", "--out"]),
+        (udp_finger.main, ["--report"]),
+        (servo_study.main, ["--out"]),
+    ],
+    ids=lambda entry: " ".join(entry).replace(PROBLEM, "") if isinstance(entry, list) else "",
+)
+@pytest.mark.parametrize(
+    "name, reason",
+    [
+        ("", "is empty"),
+        ("n" * 300, "File name too long"),
+        ("µ" * 150, "File name too long"),
+        ("empty/x", "/empty, which is no folder"),
+        ("/dev/null/x", "/dev/null, which is no folder"),
+        ("/dev/full", "is no fo lder or file"),
+        ("a\nb", "holds a control character"),
+        ("a\0b", "holds a control character"),
+        ("THE OTHER KIND", "; name a "),
+    ],
+)
+def test_where_nothing_can_be_written_is_refused_before_anything_is_done(
+    files, main, words, name, reason
+):
+    is_file = main is udp_finger.main or (main is design.main and words[-1] == "--out")
+    name = name.replace("THE OTHER KIND", "folder" if is_file else "empty")
+    reason = reason.replace("fo lder or file", "file" if is_file else "folder")
+    code, said, _ = run(main, [*words, name])
+    assert code == 2 and reason in said.splitlines()[-1] and "Traceback" not in said
+    assert sorted(os.listdir()) == files
+
+
+def test_letters_that_a_terminal_does_not_have_end_nothing(monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), "ascii", write_through=True)
+    say = types.SimpleNamespace(main=lambda: print("5 µm"))
+    monkeypatch.setattr(start.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(importlib, "import_module", lambda name: say)
+    monkeypatch.setattr(sys, "stdout", terminal)
+    start.executable("a")()
+    assert terminal.buffer.getvalue() == b"5 ?m\n"
+
+
+def test_a_commissioning_that_nobody_answers_ends_with_a_line(files, monkeypatch):
+    monkeypatch.setattr(commission, "commission", lambda bench, console, agree: agree("step?"))
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+    code, said, _ = run(commission.main, ["--driver=simulated"])
+    assert (code, said) == (1, "commission: nobody is there to answer; --yes asks nothing\n")
+
+
+def test_a_working_directory_that_is_gone_is_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tmp_path.rmdir()
+    code, said, _ = run(identification.main, ["hysteresis", "/nowhere.csv"])
+    assert code == 2 and said.endswith("is below the working directory, which is gone\n")
+
+
+def test_what_the_machine_refuses_is_said_in_a_line(monkeypatch):
+    def write():
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/report.html")
+
+    monkeypatch.setattr(start.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(importlib, "import_module", lambda name: types.SimpleNamespace(main=write))
+    said = "command: [Errno 28] No space left on device: 'out/report.html'\n"
+    assert run(start.executable("a"), []) == (1, said, "")
 
 
 COMMANDS = {

@@ -24,6 +24,7 @@ LEVELS = [
         "start",
         "options",
         "files",
+        "report",
     },
     {
         "hysteresis",

@@ -3,6 +3,7 @@
 
 import copy
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from piezo_control.hysteresis import (
     play_history,
     reachable_range,
 )
-from piezo_control.parameters import ParameterError
+from piezo_control.parameters import ParameterError, build
 
 LIMIT = 40.0  # V
 
@@ -120,6 +121,39 @@ def test_inverse_started_from_zero_after_a_history_is_wrong_by_volts():
     remanent = actuator.step(0.0)
     assert abs(fresh.step(remanent)) > 5.0
     assert abs(actuator.inverse().step(remanent)) < 1e-12
+
+
+@given(hysteresis_parameters(), st.floats(0.0, 1.0), st.floats(0.0, LIMIT))
+@settings(deadline=None)
+def test_a_virgin_share_bends_the_first_rise_and_the_first_fall_alike(parameters, share, voltage):
+    """By the joins: a part 1 - v at r, and v/2 each at 0 and at 2 r."""
+    r, w = np.array(parameters.thresholds), np.array(parameters.weights)
+    at_r, at_2r = np.maximum(voltage - r, 0.0), np.maximum(voltage - 2.0 * r, 0.0)
+    expected = w @ ((1.0 - share) * at_r + 0.5 * share * (voltage + at_2r))
+    virgin = replace(parameters, virgin_share=share)
+    for side in (1.0, -1.0):
+        there = deflection_history(virgin, [side * voltage])[0]
+        assert there == pytest.approx(side * expected, abs=1e-18)
+
+
+@pytest.mark.parametrize("share", [-0.01, 1.01])
+def test_a_virgin_share_that_is_no_part_is_refused(share):
+    message = rf"finger.yaml: 'virgin_share' is {share}, must be in \[0, 1\]"
+    with pytest.raises(ParameterError, match=message):
+        build(HysteresisParameters, {"virgin_share": share}, "finger.yaml")
+
+
+@given(hysteresis_parameters(), st.floats(0.0, 1.0), histories)
+@settings(deadline=None)
+def test_of_a_virgin_share_nothing_is_left_once_the_voltage_has_been_to_both_ends(
+    parameters, share, history
+):
+    largest = max(parameters.thresholds[-1], LIMIT)
+    history = [2.0 * largest, -2.0 * largest, *history]
+    virgin = deflection_history(replace(parameters, virgin_share=share), history)
+    np.testing.assert_allclose(
+        virgin[1:], deflection_history(parameters, history)[1:], rtol=0, atol=1e-18
+    )
 
 
 def test_initial_states_can_be_given():

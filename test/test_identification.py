@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hysteresis from recordings: known weights come back, and a measured actuator is described."""
 
+import re
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +69,34 @@ def test_weights_come_back_from_a_vibrating_finger():
     lag = -0.5 * plant.sample_time
     model = identify_hysteresis(measurement, plant.hysteresis.thresholds, lag=lag)
     np.testing.assert_allclose(model.parameters.weights, plant.hysteresis.weights, rtol=0.01)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.45, 1.0])
+def test_a_virgin_share_is_found_back_from_a_recording_that_begins_at_rest(share):
+    truth = replace(HysteresisParameters(), virgin_share=share)
+    model = identify_hysteresis(recorded(truth, 1e-3, offset=3e-6), truth.thresholds, lag=0.0)
+    half = model.confidence["hysteresis.virgin_share"]
+    assert half < 0.01
+    assert model.parameters.virgin_share == pytest.approx(share, abs=0.01)
+    # The loops are identified from later rows, of which none depends on it.
+    np.testing.assert_allclose(model.parameters.weights, truth.weights, rtol=0.01)
+
+
+def test_no_virgin_share_is_found_where_nothing_tells_of_it():
+    """A finger whose plays are at 0, one that was in use, and a recording that begins elsewhere."""
+    truth = HysteresisParameters()
+    whole = recorded(truth, 1e-3)
+    profile = decaying_sine(40.0, cycles=20)
+    used = deflection_history(truth, np.concatenate(([40.0], profile.at(whole.time))))[1:]
+    virgin = replace(truth, virgin_share=0.45)
+    for measurement, why in (
+        (whole, "not told from 0"),
+        (replace(whole, deflection=used), r"begins [\d.]+ µm beside the rest of its later loops"),
+        (recorded(virgin, 1e-3).part(slice(60, None)), "does not begin at 0 V"),
+    ):
+        model = identify_hysteresis(measurement, truth.thresholds, lag=0.0)
+        assert model.parameters.virgin_share == 0.0
+        assert re.search(why, model.untold), model.untold
 
 
 def test_lag_and_offset_are_told_from_the_hysteresis():

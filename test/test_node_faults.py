@@ -506,6 +506,26 @@ def test_unusable_arguments_end_with_one_line(arguments, words, monkeypatch, cap
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ("{voltage_high: 1.0e+30}", "voltage_high"),
+        ("{voltage_high: text}", "voltage_high"),
+        ("{voltage_low: 50.0}", "must be below 'voltage_high'"),
+        ("{voltage_hihg: 5.0}", "did you mean 'voltage_high'?"),
+    ],
+)
+def test_what_is_refused_of_a_file_names_the_file(given, words, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"/**/feedforward:\n  ros__parameters: {given}\n")
+    arguments = ["--ros-args", "--params-file", str(file), "-p", "slew_limit:=1.0e4"]
+    monkeypatch.setattr(sys, "argv", ["feedforward", *arguments])
+    monkeypatch.setattr(base, "stop_at_signals", Stop)
+    assert base.run(FeedforwardNode) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert words in said and said.endswith(f"; parameters come from {file}, -p")
+
+
 def test_whole_numbers_stand_for_doubles():
     given = ("voltage_high:=20", "hysteresis.weights:=[1]", "hysteresis.thresholds:=[0]")
     rclpy.init(args=["--ros-args", *(word for text in given for word in ("-p", text))])

@@ -20,6 +20,9 @@ from ament_index_python.packages import get_package_prefix
 pytest.importorskip("bokeh")
 
 from bokeh.events import ButtonClick
+from bokeh.util.token import generate_jwt_token, generate_session_id
+from tornado.ioloop import IOLoop
+from tornado.websocket import websocket_connect
 
 from piezo_control.nodes import panel as panel_node
 from piezo_control.nodes.client import ClientError, connect
@@ -241,6 +244,29 @@ def test_what_a_panel_does_again_and_again_goes_on_after_something_went_wrong(ca
         asyncio.run(panel_node.repeat(act))
     assert done == [0, 1, 2]
     assert "RuntimeError: once" in caplog.text
+
+
+def test_a_page_that_is_closed_after_it_was_given_up_is_no_error(caplog, monkeypatch):
+    """Bokeh gives up a page whose connection is dead when it looks after all of them, before it hears of its end."""
+    monkeypatch.setattr(panel_node, "build", lambda document, bench: None)
+
+    async def come_and_go():
+        server = panel_node.serve(None, "localhost", 0, IOLoop.current())
+        server.start()
+        token = generate_jwt_token(generate_session_id())
+        where = f"ws://localhost:{server.port}/ws"
+        page = await websocket_connect(where, subprotocols=["bokeh", token])
+        await page.read_message()  # it is open
+        (connection,) = server._tornado._clients
+        handler = connection._socket
+        server._tornado.client_lost(connection)
+        page.close()
+        while not handler._on_close_called:
+            await asyncio.sleep(0.01)
+        server.stop()
+
+    asyncio.run(asyncio.wait_for(come_and_go(), TIMEOUT))
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
 
 
 # --- in a browser -------------------------------------------------------------------------------------

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, ss2tf
 
-from piezo_control.feedback import Feedback, FeedbackParameters
+from piezo_control.feedback import Feedback, FeedbackParameters, read_controller
 from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.metrics import settling_time, step_metrics
 from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
-from piezo_sim.engine import run
+from piezo_control.sensorless import SensorlessParameters
+from piezo_sim.engine import run, run_led
 from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.temperature import TemperatureParameters
 
@@ -101,6 +102,28 @@ def test_force_step_stops_ringing(resonance, damping):
     after = done.true_deflection[1000:] - 5e-6
     assert np.abs(after).max() > static
     assert settling_time(done.time[1000:], after, 0.0, 0.05 * static) <= 15e-3
+
+
+@pytest.mark.parametrize("degc", [22.0, 32.0])
+@pytest.mark.parametrize(
+    ("name", "spread", "gain", "settled"),
+    [("following", 0.1, 0.1, 4e-3), ("following_adapted", 0.03, 0.02, 2.7e-3)],
+)
+def test_a_model_is_followed_at_any_temperature(name, spread, gain, settled, degc):
+    """As the problems in params/ ask, with a sample and the sensor's resolution added."""
+    controller, models, height = read_controller(name), SensorlessParameters(), 18e-6
+    profile, samples = Profile([0.0, STEP_AT * H], [0.0, height]), STEP_AT + 400
+    temperatures = TemperatureParameters(base_degc=degc)
+    for factors in itertools.product(
+        (1.0 - spread, 1.0, 1.0 + spread), (0.5, 2.0), (1.0 - gain, 1.0, 1.0 + gain)
+    ):
+        done, _ = run_led(
+            finger(*factors), controller, models, temperatures, profile, samples, samples
+        )
+        found = step_metrics(done.time[STEP_AT:] - STEP_AT * H, done.deflection[STEP_AT:], height)
+        assert found.settling_5_reference_s <= settled + H
+        assert found.overshoot <= 0.0049 + NOMINAL.sensor.resolution / height
+        assert done.clipped == 0
 
 
 # By code that shares nothing with the certificate: scipy's sampling, polynomials, and a loop in Python.

@@ -11,12 +11,19 @@ from rich.progress import Progress
 
 from piezo_control.creep import CreepParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
-from piezo_control.hysteresis import Hysteresis, HysteresisParameters, operator_inverse
+from piezo_control.hysteresis import (
+    Hysteresis,
+    HysteresisParameters,
+    at_rest,
+    from_rest,
+    operator_inverse,
+    operator_step,
+)
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import read
 from piezo_control.sensorless import Sensorless, SensorlessParameters
-from piezo_control.shaping import ShapingParameters
+from piezo_control.shaping import ShapingParameters, ahead, shaper
 from piezo_control.thermal import ThermalParameters
 from piezo_sim import engine
 from piezo_sim.experiment import sensorless as study
@@ -47,15 +54,35 @@ def test_operator_inverse_solves_its_equation(past, voltage, scale, line):
     assert found == pytest.approx(voltage, abs=1e-11)
 
 
+@settings(deadline=None)
+@given(
+    st.floats(0.0, 1.0),
+    st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=20),
+    st.floats(0.5, 2.0),
+    st.floats(-1e-7, 1e-7),
+)
+def test_operator_inverse_is_exact_from_the_first_rise_on(share, history, scale, line):
+    """With a virgin share plays are no history of one another: they join in any order."""
+    operator = from_rest(HysteresisParameters(virgin_share=share), H)
+    actuator, probe = at_rest(operator), at_rest(operator)
+    for voltage in history:
+        value = scale * operator_step(operator, probe, voltage) + line * voltage
+        found = operator_inverse(operator, actuator, value, scale, line)
+        assert found == pytest.approx(voltage, abs=1e-11)
+        operator_step(operator, actuator, found)
+
+
 @pytest.mark.parametrize(
     "temperatures",
     [TemperatureParameters(), TemperatureParameters(base_degc=32.0), WARMING],
     ids=["22", "32", "ramp"],
 )
 def test_nothing_is_left_of_creep_and_heat_on_a_finger_that_is_the_model(temperatures):
+    hysteresis = HysteresisParameters(virgin_share=0.4)
     run = engine.run_sensorless(
-        CantileverParameters(), SensorlessParameters(), temperatures, STEP, 300_000, every=10
-    )
+        CantileverParameters(hysteresis=hysteresis), SensorlessParameters(hysteresis=hysteresis),
+        temperatures, STEP, 300_000, every=10,
+    )  # fmt: skip
     error = np.abs(run.true_deflection - run.reference)
     # Vibration is over. The voltage that undoes creep reaches the tip through D(s), late by its a1 = 8 µs:
     # at 32 °C creep is a few µm/s at first.
@@ -135,14 +162,29 @@ def test_the_truth_plant_is_held_within_2_percent_by_models_identified_from_reco
     assert np.max(np.abs(alone[1])) > 15.0
 
 
-@pytest.mark.parametrize("name", ["1hz_22degc", "1hz_32degc", "10hz_22degc", "10hz_32degc"])
-def test_sines_of_the_truth_plant_stay_within_2_percent_after_the_first_rise(truth, name):
-    """The first rise from rest is no half of Bouc-Wen's loop: 2.8 to 3.2 %."""
-    ((time, error),) = errors(truth, study.ALL_MODELS, name).values()
-    period = (time[-1] - study.START) / 3.0
-    first = time < study.START + period
-    assert np.max(np.abs(error[~first])) <= 2.0
-    assert np.max(np.abs(error[first])) <= 3.3
+SINES = [f"{hertz}hz_{degc}degc" for hertz in (1, 10, 50) for degc in (22, 32)]
+
+
+@pytest.mark.parametrize("name", SINES)
+def test_sines_of_the_truth_plant_stay_within_2_percent_from_rest_on(truth, name):
+    """Without a virgin share the first rise is off by 2.8 to 4.3 %, as it is no half of Bouc-Wen's loop."""
+    ((_, error),) = errors(truth, study.ALL_MODELS, name).values()
+    assert np.max(np.abs(error)) <= 2.0
+
+
+@pytest.mark.parametrize("amplitude", [-20e-6, 10e-6, -5e-6])
+@pytest.mark.parametrize("degc", [22.0, 32.0])
+def test_so_do_those_that_begin_downward_and_smaller_ones(truth, amplitude, degc):
+    """A first fall that no recording told of."""
+    _, models = truth
+    time = np.arange(0.0, 3.0, 1e-3)
+    wanted = Profile(time, amplitude * np.sin(2.0 * np.pi * time), linear=True)
+    taps = shaper(models.shaping, models.dynamics.denominator, H)
+    run = engine.run_sensorless(
+        CantileverParameters(plant="truth"), models, TemperatureParameters(base_degc=degc),
+        ahead(wanted, 0.0, 3.0, taps, H), 30_000,
+    )  # fmt: skip
+    assert np.max(np.abs(run.true_deflection - wanted.at(run.time))) <= 0.02 * study.STROKE
 
 
 @settings(deadline=None, max_examples=30)
@@ -180,12 +222,31 @@ def led_by_a_controller():
     return law
 
 
-def test_a_controller_is_led_through_the_inverse_hysteresis():
-    law = led_by_a_controller()
+@pytest.mark.parametrize("degc", [12.0, 22.0, 32.0])
+def test_a_controller_meets_the_same_finger_at_any_temperature(degc):
+    """What the voltage does to H_s(U, theta), by thermal.py's equation, is the command."""
+    p = SensorlessParameters()
+    law = Sensorless(p, H, degc)
+    operator, warmth = Hysteresis(p.hysteresis, H), degc - 22.0
+    for k in range(1000):
+        command = 15e-6 * math.sin(k / 200.0)
+        voltage = law.lead(command, degc)
+        cold = operator.step(voltage)
+        lag = sum(p.hysteresis.weights) * voltage - cold
+        warm = (1.0 + p.thermal.gain_per_degc * warmth) * (
+            cold - p.thermal.lag_per_degc * warmth * lag
+        )
+        assert warm == pytest.approx(command, abs=1e-15)
+
+
+def test_a_controller_meets_a_finger_of_the_nominal_gain_once_that_is_adapted():
+    law = Sensorless(SensorlessParameters(), H, 22.0)
+    law.state.adapted.gain[0] = 1.05
     inverse = Feedforward(FeedforwardParameters(), H)
     for k in range(1000):
-        voltage = inverse.step(15e-6 * math.sin(k / 200.0))
-    assert law.voltage == pytest.approx(voltage, abs=1e-11)
+        command = 15e-6 * math.sin(k / 200.0)
+        voltage = inverse.step(command / 1.05)
+        assert law.lead(command, 22.0) == pytest.approx(voltage, abs=1e-9)
 
 
 def test_the_sensor_is_taken_away_in_mid_run_and_given_back_without_a_bump():

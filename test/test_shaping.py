@@ -9,8 +9,10 @@ import pytest
 from piezo_control import shaping
 from piezo_control.dynamics import DynamicsParameters, Motion, move, propagator
 from piezo_control.parameters import ParameterError
+from piezo_control.profile import Profile
 from piezo_control.shaping import (
     ShapingParameters,
+    ahead,
     delay,
     longest,
     residual_vibration,
@@ -53,6 +55,32 @@ def test_taps_sum_to_1_and_none_is_negative(kind):
     taps = np.array(shaper(ShapingParameters(kind=kind), DENOMINATOR, H))
     assert np.sum(taps) == pytest.approx(1.0, abs=1e-12)
     assert np.min(taps) >= 0.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_profile_that_is_known_ahead_is_reached_at_the_end_of_its_sample(kind):
+    """Exactly on straight lines; around a bend the shaper's own miss m is left as m - a * m."""
+    taps = np.array(shaper(ShapingParameters(kind=kind), DENOMINATOR, H))
+    bend = Profile([0.0, 0.02, 0.04], [0.0, 0.0, 1.0], linear=True)
+    plan = ahead(bend, 0.0, 0.04, taps, H)
+    past = [0.0] * longest(taps, 1.0)
+    reached = np.array([shape(taps, past, plan.at(k * H), 1.0) for k in range(400)])
+    end = H * np.arange(1, 401)
+    span = len(taps) * H
+    far = (np.abs(end - 0.02) > 2.0 * span) & (end < 0.04 - 2.0 * span) & (end > span)
+    np.testing.assert_allclose(reached[far], bend.at(end)[far], rtol=0, atol=1e-12)
+
+    def shaped(time):
+        return sum(tap * bend.at(time - j * H) for j, tap in enumerate(taps))
+
+    def missed(time):
+        return bend.at(time) - shaped(time + delay(taps, H))
+
+    late = delay(taps, H)
+    left = missed(end) - sum(tap * missed(end + late - j * H) for j, tap in enumerate(taps))
+    near = ~far & (end < 0.03)
+    np.testing.assert_allclose(bend.at(end)[near], (reached + left)[near], rtol=0, atol=1e-12)
+    assert np.max(np.abs(left[near])) < np.max(np.abs(missed(end)[near]))
 
 
 @pytest.mark.parametrize("kind", ["zero_vibration", "robust"])

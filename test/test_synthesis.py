@@ -11,6 +11,7 @@ import control
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.signal
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from weights import FAST, needs_slycot
@@ -24,7 +25,12 @@ from piezo_control.design.hinf import (
     smallest_gamma,
     solve,
 )
-from piezo_control.design.linear_loop import controller_response
+from piezo_control.design.linear_loop import (
+    closed_loop,
+    controller_response,
+    fingers,
+    respond,
+)
 from piezo_control.design.problem import (
     DesignProblem,
     FingerModel,
@@ -177,6 +183,31 @@ def test_prefilter_passes_a_constant_unchanged():
     feedback, reference = controller_response(controller, np.array([1.0 + 1e-9 + 0j]))
     # F(1) = 1: the path of the reference besides the error's is zero.
     assert abs(reference[0]) < 1e-6 * abs(feedback[0])
+
+
+@pytest.mark.parametrize("pole", [0.0, 2500.0])
+def test_the_nominal_finger_follows_its_model_and_leaves_the_controller_nothing(pole):
+    """Whatever the controller: D(s) F(s) by scipy's bilinear transform, before D(s) by its hold and the delay."""
+    slow = TransferFunction((100.0,), (1e-4, 1.0, 0.0))
+    p = DesignProblem(
+        method="given", controller=slow, prefilter=Prefilter(2000.0, 0.8, pole), feedforward=1.0,
+        follows=True,
+    )  # fmt: skip
+    loop = closed_loop(fingers(p.finger), synthesize(p).controller)
+    wished = np.polymul((1.0, 3200.0, 4e6), (1.0, pole) if pole else (1.0,))
+    ahead = scipy.signal.cont2discrete(
+        (wished[-1] * np.array(p.finger.denominator), wished), 1e-4, "bilinear"
+    )
+    plant = scipy.signal.cont2discrete(([1.0], p.finger.denominator), 1e-4, "zoh")
+    command = scipy.signal.lfilter(np.ravel(ahead[0]), ahead[1], np.ones(100))
+    reading = np.append(0.0, scipy.signal.lfilter(np.ravel(plant[0]), plant[1], command))
+    np.testing.assert_allclose(respond(loop, "reference", 100)[0], reading[:100], atol=1e-9)
+    assert reading[-1] == pytest.approx(1.0, abs=5e-3)
+
+
+def test_no_finger_follows_at_once():
+    with pytest.raises(ParameterError, match="'prefilter.frequency' must be above 0"):
+        DesignProblem(follows=True)
 
 
 @pytest.mark.parametrize("name", ["paper", FAST])

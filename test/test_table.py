@@ -23,6 +23,9 @@ COLUMNS = {
     "labview.lvm": {"time": "X_Value"},
     "oscilloscope_head.csv": {"voltage": "CH1", "deflection": "CH2:um"},
     "oscilloscope_units.csv": {"voltage": "A", "deflection": "B"},
+    "oscilloscope_increment.csv": {"time": "X", "voltage": "CH1", "deflection": "CH2:um"},
+    "polytec.txt": {"deflection": "Displacement"},
+    "attocube.csv": {"voltage": "U", "deflection": "Axis 1"},
     "oscilloscope_numbers.csv": {"time": "x-axis", "voltage": "1", "deflection": "2:um"},
 }
 
@@ -400,6 +403,88 @@ def test_a_word_for_no_number_is_as_good_as_an_empty_cell(tmp_path, word, place)
         np.testing.assert_allclose(found.time, 0.1 * kept)
         np.testing.assert_allclose(found.deflection, 2e-6 * kept)
         assert "3 rows with empty cells left out" in found.description
+
+
+@pytest.mark.parametrize(
+    "word", ["OVERLOAD", "OL", "O.L", "OVLD", "+OVER", "-Over Range", "****", "9.9E+37", "-1E+37"]
+)
+def test_values_beyond_the_range_of_an_instrument_are_counted_and_many_refused(tmp_path, word):
+    """As multimeters, vibrometers and oscilloscopes write them; the numbers are IEEE 488.2's and an older one's."""
+    path = tmp_path / "a.csv"
+    table = [[f"{0.1 * k:.1f}", f"{k % 7}", f"{2 * k}"] for k in range(400)]
+    for row in (100, 101, 399):
+        table[row][2] = word
+    table[7][1] = "--"
+    for bad in (range(0), range(200, 210)):
+        for row in bad:
+            table[row][2] = word
+        path.write_text("time,voltage,deflection_um\n" + "".join(",".join(r) + "\n" for r in table))
+        if not bad:
+            found = read_measurement(path)
+            said = (
+                "4 rows with empty cells left out, in 3 of which an instrument was out of its range"
+            )
+            assert len(found.time) == 396 and said in found.description
+    with pytest.raises(MeasurementError, match="in 13 of them an instrument was out of its range"):
+        read_measurement(path)
+
+
+@pytest.mark.parametrize("unit, degc", [("K", 22.0), ("kelvin", 22.0), ("°F", 22.0), ("C", 295.15)])
+def test_temperatures_are_read_in_kelvin_and_fahrenheit(tmp_path, unit, degc):
+    """22 °C are 295.15 K and 71.6 °F."""
+    value = 71.6 if unit == "°F" else 295.15
+    path = tmp_path / "a.csv"
+    rows = [f"{0.1 * k:.1f},{k % 7},{2 * k},{value}\n" for k in range(60)]
+    path.write_text(f"time,voltage,deflection_um,temperature [{unit}]\n" + "".join(rows))
+    np.testing.assert_allclose(read_measurement(path).temperature, degc)
+    path.write_text(path.read_text().replace(f" [{unit}]", ""))
+    np.testing.assert_allclose(
+        read_measurement(path, {"temperature": f"3:{unit}"}).temperature, degc
+    )
+
+
+def test_temperatures_that_may_be_kelvin_are_asked_for_and_impossible_ones_refused(tmp_path):
+    path = tmp_path / "a.csv"
+
+    def write(heading, degc):
+        rows = [f"{0.1 * k:.1f},{k % 7},{2 * k},{degc}\n" for k in range(60)]
+        path.write_text(f"time,voltage,deflection_um,{heading}\n" + "".join(rows))
+
+    write("temperature", 295.15)
+    with pytest.raises(MeasurementError, match="around 295.1.* may be kelvin: .*--temperature 3:K"):
+        read_measurement(path)
+    write("temperature K", 22.0)  # of a thermocouple of type K
+    with pytest.raises(MeasurementError, match=r"is -251.15, must be within .* °C; read in kelvin"):
+        read_measurement(path)
+    assert read_measurement(path, {"temperature": "3:degC"}).temperature[0] == 22.0
+
+
+def test_a_clock_in_milliseconds_since_1970_is_not_taken_for_seconds(tmp_path):
+    path = write_table(tmp_path / "a.csv", time=lambda k: f"{1795687200000 + 100 * k}")
+    assert read_measurement(path, {"time": "0:ms"}).sample_time == pytest.approx(0.1)
+    path = write_table(path, ["time", *HEADINGS[1:]], lambda k: f"{1795687200000 + 100 * k}")
+    with pytest.raises(MeasurementError, match="may be ms, us or ns since 1970: .*--time 0:ms"):
+        read_measurement(path)
+
+
+def test_what_is_below_the_data_is_left_out_and_said(tmp_path):
+    """Words in any other row stay an error."""
+    path = write_table(tmp_path / "a.csv")
+    data = path.read_text()
+    path.write_text(data + "\nStatistics\nMean,3,59\nStd. Dev.:,2,34\nEnd of the measurement\n")
+    found = read_measurement(path)
+    assert (
+        len(found.time) == 60 and "4 rows of words or of a summary at the end" in found.description
+    )
+    words = [
+        "words,time,voltage,deflection_um\n",
+        *(f"max,{0.1 * k:.1f},{k % 7},{k}\n" for k in range(60)),
+    ]
+    path.write_text("".join(words))
+    assert len(read_measurement(path).time) == 60
+    path.write_text(data + "Mean,3,59\n6.0,1,2\n")
+    with pytest.raises(MeasurementError, match="row 62 is 'Mean', must be a finite number"):
+        read_measurement(path)
 
 
 def test_a_row_of_words_for_no_number_has_no_names(tmp_path):

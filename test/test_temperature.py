@@ -82,6 +82,15 @@ def test_replay_of_a_csv_joins_its_points(tmp_path):
     assert got[[0, 1000, 2000, 2500, 3999]] == pytest.approx([22.0, 27.0, 32.0, 31.0, 30.0])
 
 
+def test_replay_reads_kelvin_where_the_heading_says_so(tmp_path):
+    file = tmp_path / "t.csv"
+    file.write_text("time,temperature [K]\n0.0,295.15\n1.0,305.15\n")
+    assert values(2, profile="replay", file=str(file))[0] == pytest.approx(22.0)
+    file.write_text("time,temperature\n0.0,295.15\n1.0,305.15\n")
+    with pytest.raises(ParameterError, match=r"may be kelvin: .*'temperature \[K\]'"):
+        values(2, profile="replay", file=str(file))
+
+
 def test_a_csv_that_changed_is_read_again(tmp_path):
     file = tmp_path / "t.csv"
     for number, degc in enumerate((22.0, 23.0)):

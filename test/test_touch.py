@@ -96,7 +96,7 @@ def close(plant, models, contact, degc=22.0, speed=500e-6, target=12e-6, hold=0.
     return got, push, int(np.argmax(got.total_force < 0.0))
 
 
-TOLD = {"prandtl_ishlinskii": 0.02e-3, "truth": 0.13e-3}
+TOLD = {"prandtl_ishlinskii": 0.02e-3, "truth": 0.03e-3}
 """What the push is told to within (N): it was measured to be, see docs/touch.md."""
 
 
@@ -158,6 +158,21 @@ def test_the_force_is_held_while_the_temperature_rises(plant, models):
         held = force[0]
         assert np.max(np.abs(force - held)) < 0.15e-3, (plant, stiffness)
         assert 0.8 * limit < force.min(), (plant, stiffness)  # nothing is dropped
+
+
+def test_the_first_rise_of_a_finger_of_another_class_is_not_taken_for_a_push(models):
+    """After 8 µm the other way: without its virgin share it is, with 0.36 mN, and never arrives."""
+    got, push = run_touching(
+        CantileverParameters(plant="truth", contact=ContactParameters(1e3, 0.05, AWAY)),
+        touch_of("truth"),
+        models["truth"],
+        TemperatureParameters(),
+        Profile([BEGIN, 0.2, 0.4], [0.0, -8e-6, 12e-6], linear=True),
+        Profile([0.0], [LIMIT]),
+        9000,
+    )
+    assert np.max(np.abs(push[got.total_force == 0.0])) < 0.06e-3
+    assert -got.total_force[-1000:].mean() == pytest.approx(LIMIT, rel=0.1)
 
 
 def test_position_is_reached_and_kept_where_nothing_is_in_the_way(models):

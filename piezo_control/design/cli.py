@@ -6,7 +6,7 @@ specifications, and either weights or nothing, in which case they are found from
 The controller is written only when the recomputed closed loop meets every specification (or with
 --force, and then says that it is not certified). With --cantilever, a finger of which a block was neither
 identified nor written by hand is refused, unless --assume says that the paper's may stand for it. Next to it, into --report: certificate.json, the
-complete problem with everything that was found, and pictures.
+complete problem with everything that was found, pictures, and a page (HTML) of all to zoom in.
 
 Exit code: 0 certified, 1 not certified, 2 unusable input or a problem without a solution.
 """
@@ -40,6 +40,7 @@ from piezo_control.hysteresis import (  # noqa: E402
     coefficients,
     reachable_range,
 )
+from piezo_control.options import output_file, output_folder  # noqa: E402
 from piezo_control.parameters import (  # noqa: E402
     ParameterError,
     T,
@@ -49,6 +50,7 @@ from piezo_control.parameters import (  # noqa: E402
     flatten,
     load,
 )
+from piezo_control.report.page import Section, write_html  # noqa: E402
 from piezo_control.safety import VoltageParameters  # noqa: E402
 from piezo_control.thermal import ThermalParameters  # noqa: E402
 
@@ -200,7 +202,7 @@ def write_report(
     certificate: Certificate,
     origin: str,
 ) -> list[Path]:
-    """Write certificate, complete problem and pictures; return their paths. `origin` is the finger's."""
+    """Write certificate, complete problem, pictures and a page of all; return their paths. `origin` is the finger's."""
     folder.mkdir(parents=True, exist_ok=True)
     content = {**certificate.as_dict(), "origin": origin.splitlines()}
     as_json = write_json(folder / "certificate.json", content)
@@ -211,7 +213,18 @@ def write_report(
         flatten(problem),
         f"Design problem of '{problem.name}', nothing left open.",
     )
-    return [as_json, solved, *design_plots.draw(problem, controller, certificate, folder)]
+    pictures = design_plots.draw(problem, controller, certificate, folder)
+    rows = [cells(row) for row in certificate.rows]
+    drawn = [(picture, picture.stem) for picture in pictures]
+    page = write_html(
+        folder / "certificate.html",
+        title(certificate),
+        [
+            Section("Certificate", summary(certificate), columns=HEADINGS, rows=rows),
+            Section("The loops of the box", origin, drawn),
+        ],
+    )
+    return [as_json, solved, *pictures, page]
 
 
 HEADINGS = ("specification", "required", "nominal", "worst case", "met", "worst at")
@@ -227,10 +240,14 @@ def cells(row: Row) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+def title(certificate: Certificate) -> str:
+    """Return name and verdict of a certificate."""
+    return f"{certificate.name}: {'certified' if certificate.met else 'NOT certified'}"
+
+
 def show(console: Console, certificate: Certificate) -> None:
     """Print the certificate as a table, and the figures that nothing is required of."""
-    verdict = "certified" if certificate.met else "NOT certified"
-    table = Table(title=f"{certificate.name}: {verdict}", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=title(certificate), box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in HEADINGS[:-1]:
         table.add_column(heading, justify="right" if heading in NUMERIC else "left")
     for row in certificate.rows:
@@ -292,10 +309,12 @@ def parse() -> argparse.Namespace:
         "problem", type=Path, help="design problem, e.g. params/synthesis_robust.yaml"
     )
     parser.add_argument(
-        "--out", type=Path, help="controller to write (feedback_<name>.yaml in this folder)"
+        "--out", type=output_file, help="controller to write (feedback_<name>.yaml in this folder)"
     )
     parser.add_argument(
-        "--report", type=Path, help="folder of certificate and pictures (out/synthesize/<name>)"
+        "--report",
+        type=output_folder,
+        help="folder of certificate and pictures (out/synthesize/<name>)",
     )
     parser.add_argument(
         "--cantilever",

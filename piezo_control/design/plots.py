@@ -14,7 +14,7 @@ from piezo_control.design.certificate import Box, Certificate, transfer_response
 from piezo_control.design.linear_loop import closed_loop, controller_response, respond
 from piezo_control.design.problem import DesignProblem
 from piezo_control.feedback import FeedbackParameters
-from piezo_control.files import replaced
+from piezo_control.report.pictures import save
 
 BOX = {"color": "tab:blue", "lw": 0.5, "alpha": 0.35}
 NOMINAL = {"color": "k", "lw": 1.4}
@@ -39,9 +39,7 @@ def draw(
     for name, figure in pictures.items():
         for axis in figure.axes:
             axis.grid(alpha=0.3)
-        paths.append(folder / f"{name}.png")
-        with replaced(paths[-1]) as (place,):
-            figure.savefig(place, dpi=110)
+        paths.append(save(figure, folder / f"{name}.png"))
     return paths
 
 

@@ -14,7 +14,9 @@ from piezo_control.parameters import ParameterError, group, parameter
 
 REACH = Feedforward(FeedforwardParameters(), sample_time=1e-4).reachable_range
 """Of the default finger (m)."""
-METHODS = ("hinf", "given", "damped_integrator", "pid", "integrator_notch")
+METHODS = (
+    "hinf", "given", "damped_integrator", "model_following", "pid", "integrator_notch",
+)  # fmt: skip
 
 
 class SynthesisError(ValueError):
@@ -159,10 +161,11 @@ class Weights:
 
 @dataclass(frozen=True)
 class Prefilter:
-    """Second-order low-pass between reference and loop; frequency 0: none."""
+    """Low-pass between reference and loop, of second order, or of third with `pole`; frequency 0: none."""
 
     frequency: float = parameter(0.0, "natural frequency", unit="rad/s", low=0.0, high=1e7)
     damping: float = parameter(0.7, "damping ratio", low=0.1, high=10.0)
+    pole: float = parameter(0.0, "third pole, real; 0: none", unit="rad/s", low=0.0, high=1e7)
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,8 @@ class DesignProblem:
     method: str = parameter(
         "hinf",
         "'hinf': from the weights; 'given': `controller`, discretised; "
-        "'damped_integrator', 'pid', 'integrator_notch': that structure, tuned to the specifications",
+        "'damped_integrator', 'model_following', 'pid', 'integrator_notch': that structure, tuned to the "
+        "specifications",
         choices=METHODS,
     )
     finger: FingerModel = group(FingerModel)
@@ -195,6 +199,11 @@ class DesignProblem:
         low=-10.0,
         high=10.0,
     )
+    follows: bool = parameter(
+        False,
+        "the prefilter F is what the finger shall do: what goes straight to the command is D(s) F r, and the "
+        "controller sees what the reading of the nominal finger lacks of that",
+    )
     controller: TransferFunction = group(TransferFunction)
 
     def __post_init__(self) -> None:
@@ -205,6 +214,10 @@ class DesignProblem:
             raise ParameterError(
                 f"'controller' is {c.numerator} / {c.denominator}, must have a numerator that is not 0 "
                 "and a pole: its slowest pole is the integrator"
+            )
+        if self.follows and not self.prefilter.frequency:
+            raise ParameterError(
+                "'follows' is true, so 'prefilter.frequency' must be above 0: no finger moves at once"
             )
         if self.method != "hinf" and self.weights:
             raise ParameterError(f"'weights' are for method 'hinf', not for '{self.method}'")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Structures to be tuned: a controller, or the weights of one, from a few positive numbers.
 
-Every structure has a start, which follows from settling time and resonance, and turns its numbers into a
-problem with nothing left open.
+Every structure has starts, which follow from settling time and resonance, and turns its numbers into a problem
+with nothing left open.
 """
 
 from __future__ import annotations
@@ -30,10 +30,20 @@ By differential evolution and simplex searches over the corners of params/synthe
 """
 
 
-class Structure(NamedTuple):
-    """Where to begin, and what the numbers mean."""
+FOLLOWING_STARTS = np.array(
+    [
+        (0.1695, 0.5848, 0.4618, 0.3772, 1.4006, 1.1622, 0.4349, 1.2457, 0.4410, 1.3828, 0.6699),
+        (0.2029, 0.6964, 0.5735, 0.3180, 1.3602, 1.2214, 0.4328, 1.1456, 0.5744, 1.2179, 0.7672),
+    ]
+)
+"""The same for `_following_candidate`, the last one a frequency too, over two boxes: params/synthesis_following.yaml
+and params/synthesis_following_adapted.yaml."""
 
-    start: Callable[[DesignProblem], list[float]]
+
+class Structure(NamedTuple):
+    """Where to begin, the best of several places, and what the numbers mean."""
+
+    starts: Callable[[DesignProblem], list[list[float]]]
     complete: Callable[[DesignProblem, np.ndarray], DesignProblem]
 
 
@@ -41,17 +51,10 @@ def _resonance(problem: DesignProblem) -> float:
     return 1.0 / math.sqrt(problem.finger.denominator[0])
 
 
-def _hinf_start(problem: DesignProblem) -> list[float]:
+def _hinf_starts(problem: DesignProblem) -> list[list[float]]:
     omega = _resonance(problem)
-    return [
-        3.0 / problem.specification.settling_time,
-        3.0,
-        0.3,
-        1e-3,
-        7.0 * omega,
-        0.45 * omega,
-        0.6,
-    ]
+    rate = 3.0 / problem.specification.settling_time
+    return [[rate, 3.0, 0.3, 1e-3, 7.0 * omega, 0.45 * omega, 0.6]]
 
 
 def _hinf_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
@@ -83,11 +86,11 @@ def shaped_weights(
     )
 
 
-def _damped_start(problem: DesignProblem) -> list[float]:
+def _damped_starts(problem: DesignProblem) -> list[list[float]]:
     """Return the best of a long search for the default finger, scaled to this one's resonance."""
     omega = _resonance(problem)
     delay = min(max(problem.finger.delay_samples, 1), len(DAMPED_STARTS))
-    return (DAMPED_STARTS[delay - 1] * np.where(IS_FREQUENCY, omega, 1.0)).tolist()
+    return [(DAMPED_STARTS[delay - 1] * np.where(IS_FREQUENCY, omega, 1.0)).tolist()]
 
 
 def _damped_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
@@ -106,9 +109,22 @@ def _damped_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
     )
 
 
-def _pid_start(problem: DesignProblem) -> list[float]:
+def _following_starts(problem: DesignProblem) -> list[list[float]]:
+    omega = _resonance(problem)
+    is_frequency = np.append(IS_FREQUENCY, True)
+    return (FOLLOWING_STARTS * np.where(is_frequency, omega, 1.0)).tolist()
+
+
+def _following_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
+    """Return the same behind a model of third order, which the finger follows."""
+    controller = _damped_candidate(problem, x[:10])
+    prefilter = dataclasses.replace(controller.prefilter, pole=float(x[10]))
+    return dataclasses.replace(controller, prefilter=prefilter, follows=True)
+
+
+def _pid_starts(problem: DesignProblem) -> list[list[float]]:
     rate = 3.0 / problem.specification.settling_time
-    return [rate, 1e-3, 1e-6, 0.5 * _resonance(problem)]
+    return [[rate, 1e-3, 1e-6, 0.5 * _resonance(problem)]]
 
 
 def _pid_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
@@ -120,9 +136,9 @@ def _pid_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
     )
 
 
-def _notch_start(problem: DesignProblem) -> list[float]:
+def _notch_starts(problem: DesignProblem) -> list[list[float]]:
     rate = 3.0 / problem.specification.settling_time
-    return [rate, _resonance(problem), 0.1, 0.5 * _resonance(problem), 0.7]
+    return [[rate, _resonance(problem), 0.1, 0.5 * _resonance(problem), 0.7]]
 
 
 def _notch_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:
@@ -145,9 +161,10 @@ def _given(
 
 
 STRUCTURES = {
-    "hinf": Structure(_hinf_start, _hinf_candidate),
-    "damped_integrator": Structure(_damped_start, _damped_candidate),
-    "pid": Structure(_pid_start, _pid_candidate),
-    "integrator_notch": Structure(_notch_start, _notch_candidate),
+    "hinf": Structure(_hinf_starts, _hinf_candidate),
+    "damped_integrator": Structure(_damped_starts, _damped_candidate),
+    "model_following": Structure(_following_starts, _following_candidate),
+    "pid": Structure(_pid_starts, _pid_candidate),
+    "integrator_notch": Structure(_notch_starts, _notch_candidate),
 }
 """By the method of the problem."""

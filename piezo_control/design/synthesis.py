@@ -18,6 +18,7 @@ import scipy.optimize
 
 from piezo_control.design import certificate
 from piezo_control.design.hinf import hinf_controller, slicot
+from piezo_control.design.linear_loop import fingers, open_loop
 from piezo_control.design.problem import (
     DesignProblem,
     Prefilter,
@@ -66,10 +67,10 @@ def synthesize(problem: DesignProblem) -> Design:
 def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackParameters:
     """Return the feedback law of a discrete controller from error to command.
 
-    `system` has its slowest pole as the first state. Adds the prefilter F, so that the controller
-    sees F r - y, the part of F r that goes straight to the command, and an anti-windup gain: the stationary Kalman gain of an observer of the controller,
-    for noise on its error and, with a variance of ANTI_WINDUP_NOISE of that, on its command. The
-    result does not count as certified: only :mod:`certificate` can say that.
+    `system` has its slowest pole as the first state. Adds the path of the reference, and an anti-windup gain: the
+    stationary Kalman gain of an observer of the controller, for noise on its error and, with a variance of
+    ANTI_WINDUP_NOISE of that, on its command. The result does not count as certified: only :mod:`certificate` can
+    say that.
     """
     a, b, c, d = system.a.copy(), system.b, system.c, system.d[0, 0]
     if problem.integrator:
@@ -84,12 +85,11 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
             "pole nor come so near that double precision does not tell them apart"
         ) from None
     anti_windup = a @ spread @ c.T / (ANTI_WINDUP_NOISE + c @ spread @ c.T)
-    filtered = realise(prefilter_transfer(problem.prefilter))
-    filtered = from_w_plane(filtered, problem.finger.sample_time / TIME_UNIT)
-    # F r - y = e + (F - 1) r.
-    direct = filtered.d[0, 0] - 1.0
-    size = len(filtered.a)
-    whole = np.block([[a, b @ filtered.c], [np.zeros((size, len(a))), filtered.a]])
+    path = reference_path(problem)
+    # The controller sees what is expected less the reading, which is the error plus (expected - r).
+    direct = path.d_expected - 1.0
+    size = len(path.a)
+    whole = np.block([[a, b @ path.c_expected], [np.zeros((size, len(a))), path.a]])
     without = np.zeros((size, 1))
 
     def values(*parts: np.ndarray) -> tuple[float, ...]:
@@ -105,11 +105,50 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
         command_high=problem.finger.command_high,
         a=values(whole),
         b=values(b, without),
-        c=values(c, (d + problem.feedforward) * filtered.c),
+        c=values(c, d * path.c_expected + path.c_ahead),
         d=float(d),
-        reference_b=values(b * direct, filtered.b) if size else (),
-        reference_d=float(d * direct + problem.feedforward * filtered.d[0, 0]),
+        reference_b=values(b * direct, path.b) if size else (),
+        reference_d=float(d * direct + path.d_ahead),
         anti_windup=values(anti_windup, without),
+    )
+
+
+class ReferencePath(NamedTuple):
+    """From the reference to the reading that the controller expects, and to the command straight ahead."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c_expected: np.ndarray
+    d_expected: float
+    c_ahead: np.ndarray
+    d_ahead: float
+
+
+def reference_path(problem: DesignProblem) -> ReferencePath:
+    """Return the path of the reference: the prefilter, or that and the nominal finger which follows it.
+
+    A finger that is the nominal one then does what the prefilter says and leaves the controller nothing to
+    mend, so that its bandwidth does not limit how quickly a reference is reached.
+    """
+    step = problem.finger.sample_time / TIME_UNIT
+    if not problem.follows:
+        f = from_w_plane(realise(prefilter_transfer(problem.prefilter)), step)
+        ahead = problem.feedforward
+        return ReferencePath(f.a, f.b, f.c, f.d[0, 0], ahead * f.c, ahead * f.d[0, 0])
+    wished = prefilter_transfer(problem.prefilter)
+    inverted = np.multiply(wished.numerator, problem.finger.denominator)
+    inverse = TransferFunction(tuple(inverted.tolist()), wished.denominator)
+    command = from_w_plane(realise(inverse), step)
+    way = open_loop(fingers(problem.finger))
+    a, b, c = way.a[0], way.b[0][:, None], way.c[None, :]
+    order, size = len(command.a), len(a)
+    return ReferencePath(
+        a=np.block([[command.a, np.zeros((order, size))], [b @ command.c, a]]),
+        b=np.vstack([command.b, b @ command.d]),
+        c_expected=np.hstack([np.zeros((1, order)), c]),
+        d_expected=0.0,
+        c_ahead=problem.feedforward * np.hstack([command.c, np.zeros((1, size))]),
+        d_ahead=problem.feedforward * command.d[0, 0],
     )
 
 
@@ -118,7 +157,10 @@ def prefilter_transfer(prefilter: Prefilter) -> TransferFunction:
     omega = prefilter.frequency
     if omega == 0.0:
         return TransferFunction((1.0,), (1.0,))
-    return TransferFunction((omega**2,), (1.0, 2.0 * prefilter.damping * omega, omega**2))
+    poles = np.array([1.0, 2.0 * prefilter.damping * omega, omega**2])
+    if prefilter.pole:
+        poles = np.polymul(poles, (1.0, prefilter.pole))
+    return TransferFunction((float(poles[-1]),), tuple(poles.tolist()))
 
 
 def tune(problem: DesignProblem) -> DesignProblem:
@@ -127,7 +169,7 @@ def tune(problem: DesignProblem) -> DesignProblem:
     Deterministic. Minimises the worst settling time over the corners of the box, plus penalties for
     what exceeds a specification; the start follows from settling time and resonance.
     """
-    start, complete = STRUCTURES[problem.method]
+    starts, complete = STRUCTURES[problem.method]
     corners = certificate.Box(problem, resonance=5, damping=3, gain=3, points=240)
 
     def cost(logarithms: np.ndarray) -> float:
@@ -138,7 +180,7 @@ def tune(problem: DesignProblem) -> DesignProblem:
             return 1e6
         return corners.cost(controller, TUNING_RESERVE)
 
-    start_logarithms = np.log(start(problem))
+    start_logarithms = min(np.log(starts(problem)), key=cost)
     simplex = np.vstack([start_logarithms, start_logarithms + 0.25 * np.eye(len(start_logarithms))])
     best = scipy.optimize.minimize(
         cost,

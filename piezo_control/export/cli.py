@@ -22,6 +22,7 @@ from pathlib import Path
 from piezo_control.export.firmware import firmware, write
 from piezo_control.feedback import FeedbackParameters, successor
 from piezo_control.nodes.parameters import ServoNodeParameters, check_delay, read_feedforward
+from piezo_control.options import output_folder
 from piezo_control.parameters import ParameterError, build, load
 from piezo_control.servo.law import objections
 
@@ -93,7 +94,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--feedforward", help="file, instead of the one in PARAMETERS")
     parser.add_argument("--name", default="finger", help="prefix of files and functions (finger)")
-    parser.add_argument("--out", type=Path, default=Path("firmware"), help="folder (firmware)")
+    parser.add_argument("--out", type=output_folder, default="firmware", help="folder (firmware)")
     parser.add_argument("--float", action="store_true", help="single precision instead of double")
     parser.add_argument(
         "--sample-time",

@@ -4,7 +4,7 @@
 Reads rosbag2 folders, text files and those of other programs; a row of a table has a deflection beside the voltage
 that was held until then (the delay is found). Writes into one folder (--out), step by step:
 feedforward.yaml (`hysteresis`; after that `dynamics` and `drift`), cantilever.yaml (`hysteresis`,
-`dynamics`, `stiffness`, `drift`), a picture and the fit's figures (JSON) of each step. After `hysteresis
+`dynamics`, `stiffness`, `drift`), a picture, the same as a page (HTML) to zoom in, and the fit's figures (JSON) of each step. After `hysteresis
 --model classical`, `dynamics` and `drift`, feedforward.yaml has all that `compensator: sensorless` needs.
 `check` judges identified parameters on another recording.
 """
@@ -56,7 +56,7 @@ from piezo_control.identification.measurement import (  # noqa: E402
     is_bag,
     read_measurement,
 )
-from piezo_control.options import within  # noqa: E402
+from piezo_control.options import output_folder, within  # noqa: E402
 from piezo_control.parameters import (  # noqa: E402
     ParameterError,
     build,
@@ -66,6 +66,7 @@ from piezo_control.parameters import (  # noqa: E402
     load,
     parameter,
 )
+from piezo_control.report.page import Section, write_html  # noqa: E402
 from piezo_control.sensorless import SensorlessParameters  # noqa: E402
 from piezo_control.thermal import REFERENCE_DEGC, ThermalParameters  # noqa: E402
 
@@ -99,7 +100,13 @@ def main(words: Sequence[str] | None = None) -> int:
     console = Console()
     try:
         arguments.out.mkdir(parents=True, exist_ok=True)
-        for written in arguments.run(arguments, console):
+        paths = arguments.run(arguments, console)
+        pictures = [(path, path.stem) for path in paths if path.suffix == ".png"]
+        for picture, name in pictures:
+            title, source = f"identify {name}", str(arguments.recording)
+            section = Section(source, figures=[(picture, "measured and modelled")])
+            paths.append(write_html(picture.with_suffix(".html"), title, [section]))
+        for written in paths:
             console.print(f"wrote {written}", soft_wrap=True)
     except (MeasurementError, ParameterError, OSError) as error:
         print(f"identify: {error}", file=sys.stderr)
@@ -157,6 +164,8 @@ def hysteresis(arguments: argparse.Namespace, console: Console) -> list[Path]:
         f"lag {model.lag * 1e3:.3g} ms, offset {model.offset * 1e6:.4g} µm, "
         f"smoothness {model.smoothness:g}"
     )
+    share = model.parameters.virgin_share
+    console.print(f"virgin share {share:.3g}" if share else f"virgin share 0: {model.untold}")
 
     feedforward = FeedforwardParameters(
         static_gain=float(np.ptp(measurement.deflection[first:]) / np.ptp(measurement.voltage)),
@@ -501,7 +510,7 @@ def said(name: str, source: str, found: Values, confidence: Values) -> str:
     """Return what a file says of an identification: its source, and how well each value is known."""
     texts = [
         source,
-        "95 % intervals by the linearised model for correlated residuals, without errors of the model itself:",
+        "95 % intervals, by what the model leaves of these recordings; what it cannot describe elsewhere is not in them:",
         *lines(found, confidence),
     ]
     return "\n".join(f"{name}: {text}" for text in texts)
@@ -605,7 +614,11 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
         help="age of a deflection (1)",
     )
     reading.add_argument(
-        "--out", "-o", type=Path, default=Path("out/identified"), help="folder (out/identified)"
+        "--out",
+        "-o",
+        type=output_folder,
+        default="out/identified",
+        help="folder (out/identified)",
     )
     for name, default, text in (
         ("--start", 0.0, "use from here on"),

@@ -11,8 +11,8 @@ from piezo_control.options import within
 QUANTITIES = {  # the units a column may have, the first of them where nothing says which
     "time": ("s", "ms", "us", "min", "h"),
     "voltage": ("V", "mV", "kV"),
-    "deflection": ("m", "mm", "um", "nm"),
-    "temperature": ("degc",),
+    "deflection": ("m", "mm", "um", "nm", "pm"),
+    "temperature": ("degc", "kelvin", "degf"),
     "tip_force": ("N", "mN", "uN"),
 }
 LOOP = {**QUANTITIES, "reference": QUANTITIES["deflection"], "command": QUANTITIES["deflection"]}

@@ -204,7 +204,9 @@ def identify_drift(
     measured = rows(deflections)
     scale = float(np.std(measured)) or 1.0
 
-    def regressors(time_constant: float, cold_share: float) -> list[NDArray]:
+    def regressors(
+        time_constant: float, cold_share: float, times: NDArray = times
+    ) -> list[NDArray]:
         blocks = []
         for number, r in enumerate(recordings):
             body = r.relax(r.temperature, time_constant, float(r.temperature[0]))
@@ -226,8 +228,10 @@ def identify_drift(
     lowest = np.full(RELAXATIONS + 4 + len(recordings), -np.inf)
     lowest[:RELAXATIONS] = 0.0
 
-    def linear(time_constant: float, cold_share: float) -> tuple[NDArray, NDArray]:
-        matrix = rows(regressors(time_constant, cold_share))
+    def linear(
+        time_constant: float, cold_share: float, times: NDArray = times
+    ) -> tuple[NDArray, NDArray]:
+        matrix = rows(regressors(time_constant, cold_share, times))
         norms = column_norms(matrix)
         triangle = np.linalg.qr(np.column_stack((matrix / norms, measured)), mode="r")
         x = lsq_linear(triangle[:, :-1], triangle[:, -1], (lowest, np.inf), method="bvls").x / norms
@@ -286,6 +290,11 @@ def identify_drift(
         for h in 1e-4 * np.eye(found.x.size)
     ]
     jacobian = np.column_stack((*searched, rows(modelled(found.x)))) * free
+    half_step = (times[1] / times[0]) ** 0.5
+    others = [
+        np.append(found.x, linear(np.exp(found.x[0]), found.x[1], grid)[0])
+        for grid in (times / half_step, times * half_step)
+    ]
     curves = [block @ x for block in modelled(found.x)]
     return DriftModel(
         **values(numbers),
@@ -298,5 +307,5 @@ def identify_drift(
             for r, deflection, m in zip(recordings, deflections, curves)
         ),
         without=tuple(straight(r.deflection[r.kept], r.static[r.kept]) for r in recordings),
-        confidence=intervals(values, numbers, jacobian, deviation),
+        confidence=intervals(values, numbers, jacobian, deviation, others=others),
     )

@@ -14,6 +14,9 @@ no part of the operator either. Half a row is added to the lag's interval, for w
 rows. Neighbouring weights are held together by a smoothness penalty chosen by cross-validation over
 segments of the loop; for equal gaps and weights the operator then obeys Rayleigh's law, which is what
 extrapolates best to other amplitudes.
+
+The rows before that, from rest to both ends, tell the virgin share of a classical operator: its deflection is
+linear in it, too, and no loop depends on it.
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ LAG_ROWS = 4000  # rows used while searching the lag
 LAG_PLAYS = 60  # and so many thresholds, of more every second, third, ...
 LAG_SMOOTHNESS = (3e-4, 0.01, 0.3, 10.0)
 LAG_GAIN = 0.02  # relative, of the deviation: a lag that gains less is not believed
+REST = 0.02  # of the stroke and of the voltage's range: so near to rest a recording begins
 MOST_ROWS = 200_000  # rows used in a fit; of longer measurements every second, third, ...
 
 
@@ -55,6 +59,7 @@ class HysteresisModel:
     lag: float  # s, by which the sensor shows a deflection late
     smoothness: float  # penalty chosen
     confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
+    untold: str = "only a classical operator has one"  # why there is no virgin share
 
     def deflection(self, time: ArrayLike, voltage: ArrayLike) -> NDArray[np.float64]:
         """Return what the sensor shows (m) under a voltage history (V) from rest."""
@@ -296,7 +301,46 @@ class _Problem:
         )
         measurement = self.measurement
         deviation = measurement.deflection - model.deflection(measurement.time, measurement.voltage)
-        return replace(model, offset=offset + float(np.mean(deviation[self.rows])))
+        model = replace(model, offset=offset + float(np.mean(deviation[self.rows])))
+        drift = self.stroke * x[len(self.thresholds) + 1]
+        at_start = model.offset - drift * float(np.mean(self.drift))
+        return model if len(self.knots) else self._first_rise(model, at_start, drift)
+
+    def _first_rise(self, model: HysteresisModel, at_start: float, drift: float) -> HysteresisModel:
+        """Add the virgin share, as told by the rows until the voltage has been to both ends."""
+        measurement = self.measurement
+        rows = slice(0, settled(measurement))
+        time, voltage = measurement.time[rows], measurement.voltage[rows]
+        straight, bent = (
+            deflection_history(replace(model.parameters, virgin_share=share), voltage)
+            for share in (0.0, 1.0)
+        )
+        bend = (bent - straight) / self.stroke
+        shown = np.interp(time + model.lag, measurement.time, measurement.deflection) - straight
+        shown -= at_start + drift * np.log1p(time - measurement.time[0])
+        start = int(np.argmin(np.abs(voltage) <= 2.0 * REST * self.half_range))
+        if not start:
+            return replace(model, untold="the recording does not begin at 0 V")
+        beside = float(np.mean(shown[:start]))
+        if abs(beside) > REST * self.stroke:
+            place = f"{beside * 1e6:.3g} µm beside the rest of its later loops"
+            return replace(model, untold=f"the recording begins {place}")
+        shown /= self.stroke
+        square = float(bend @ bend) or 1.0  # one play alone has no bend
+        share = min(1.0, max(0.0, float(bend @ shown) / square))
+        width = intervals(
+            lambda number: {"hysteresis.virgin_share": float(number[0])},
+            np.array([share]),
+            bend[:, None],
+            shown - share * bend,
+        )
+        if not np.all(share > np.array(width["hysteresis.virgin_share"])):
+            return replace(model, untold="it is not told from 0")
+        return replace(
+            model,
+            parameters=replace(model.parameters, virgin_share=share),
+            confidence={**model.confidence, **width},
+        )
 
     def _confidence(
         self, x: NDArray[np.float64], lag: float, searched: bool, penalty: NDArray[np.float64]
@@ -362,10 +406,11 @@ class _Problem:
                 changes[upper].tolist(),
                 (origin - knots[lower])[::-1].tolist(),
                 (-changes[lower])[::-1].tolist(),
+                [0.0],
             )
         )
         upper_thresholds, upper_weights, lower_thresholds, lower_weights = map(
-            tuple, dead_zones[3:]
+            tuple, dead_zones[3:7]
         )
         parameters = HysteresisParameters(
             tuple(self.thresholds.tolist()),

@@ -5,18 +5,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.axes import Axes  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-
-from piezo_control.files import replaced  # noqa: E402
-from piezo_control.identification.hysteresis import HysteresisModel  # noqa: E402
-from piezo_control.identification.measurement import Measurement  # noqa: E402
+from piezo_control.identification.hysteresis import HysteresisModel
+from piezo_control.identification.measurement import Measurement
+from piezo_control.report.pictures import save
 
 
 def loops(
@@ -33,9 +29,8 @@ def loops(
     voltage = measurement.voltage[samples]
     measured, modelled = measurement.deflection[samples] * 1e6, modelled[samples] * 1e6
     panels = 2 if model is None else 3
-    figure, (loop, error, *others) = plt.subplots(
-        1, panels, figsize=(5.5 * panels, 4.5), constrained_layout=True
-    )
+    figure = Figure(figsize=(5.5 * panels, 4.5), layout="constrained")
+    loop, error, *others = figure.subplots(1, panels)
     loop.plot(voltage, measured, "tab:blue", lw=1.2, label="measured")
     loop.plot(voltage, modelled, "tab:orange", lw=0.7, label="modelled")
     loop.set(xlabel="voltage [V]", ylabel="deflection [µm]", title=Path(measurement.source).name)
@@ -65,9 +60,8 @@ def responses(curves: list[tuple[str, NDArray]], found: list[str], path: Path) -
 
     What was `found`, with its intervals, stands above.
     """
-    figure, axes = plt.subplots(
-        len(curves), 2, figsize=(11, 3.6 * len(curves)), constrained_layout=True, squeeze=False
-    )
+    figure = Figure(figsize=(11, 3.6 * len(curves)), layout="constrained")
+    axes = figure.subplots(len(curves), 2, squeeze=False)
     for (response, error), (source, curve) in zip(axes, curves):
         time, measured, modelled = curve.T
         response.plot(time, measured * 1e6, "tab:blue", lw=1.2, label="measured")
@@ -80,9 +74,7 @@ def responses(curves: list[tuple[str, NDArray]], found: list[str], path: Path) -
     _finish(figure, path)
 
 
-def _finish(figure: plt.Figure, path: Path) -> None:
+def _finish(figure: Figure, path: Path) -> None:
     for axis in figure.axes:
         axis.grid(alpha=0.3)
-    with replaced(path) as (place,):
-        figure.savefig(place, dpi=110)
-    plt.close(figure)
+    save(figure, path)

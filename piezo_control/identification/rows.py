@@ -18,8 +18,19 @@ import pandas as pd
 
 from piezo_control.identification.units import UNITS, said_unit, unit_of
 
-MISSING = re.compile(r"(?i)|-+|-?nan|-?1\.#(ind|qnan)\w*|n/?a|null|none|#(n/a|nv|[a-z]+/?0?!)")
+OVERLOAD = re.compile(
+    r"(?i)[-+]?(ovld|ovfl|o\.?l\.?|clip(ped|ping)?|sat(urated)?|(over|under)([ _-]?(load|range|flow))?)|\*+"
+)
+"""What instruments write for a value beyond their range."""
+MISSING = re.compile(
+    rf"(?i)|-+|-?nan|-?1\.#(ind|qnan)\w*|n/?a|null|none|#(n/a|nv|[a-z]+/?0?!)|{OVERLOAD.pattern[4:]}"
+)
 """What programs write for no number; Excel's begin like a comment."""
+SUMMARY = re.compile(
+    r"(?i)(mean|average|avg|median|min(imum)?|max(imum)?|std\.?([ .]*dev\.?)?|standard deviation|s\.?d\.?|rms|variance"
+    r"|sum|total|count|range|statistics|summary|mittelwert|maxim\w*|minim\w*|standardabweichung|summe|moyenne)\s*:?"
+)
+"""What spreadsheets have in front of a row below the data."""
 COMMENT = re.compile(r"(?i)\s*(#(?!n/a|nv\b|\w+/?0?!)|%)[#%]*")
 NUMBER = re.compile(r"[-+−]?[\d.,]*\d[.,]?([eEdD][-+]?\d+)?")
 JUDGED = 50  # rows at the end, which have numbers
@@ -41,6 +52,7 @@ class Layout(NamedTuple):
     rows: list[Row]
     decimal: str
     above: int  # rows above the names
+    below: int  # rows of words or of a summary at the end
 
 
 def read_rows(data: bytes) -> tuple[list[Row], str]:
@@ -87,9 +99,15 @@ def _is_cut(rows: list[list[str]]) -> bool:
 
 def _decode(data: bytes) -> str:
     """Return the text of a file by its byte-order mark, as UTF-8, or as the Windows of a lab."""
-    for mark, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"),
-                       (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
+    for mark, name in ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"),
+                       (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):  # fmt: skip
         if data.startswith(mark):
+            return data.decode(name)
+    for first, name in (
+        (1, "utf-16-le"),
+        (0, "utf-16-be"),
+    ):  # without a mark, Latin letters have a byte of 0
+        if not len(data) % 2 and data[first::2].count(0) > 0.9 * len(data) / 2:
             return data.decode(name)
     if b"\0" in data:
         raise UnicodeDecodeError(
@@ -152,6 +170,7 @@ def layout(rows: list[Row]) -> Layout:
     row of words above the first row that looks like these, or in a comment right above it. Raises ValueError for a
     row with more cells than columns, and for names that are not as many.
     """
+    rows = _timed(rows)
     shown = [row.cells for row in rows if not row.comment][-JUDGED:]
     width = Counter(map(len, shown)).most_common(1)[0][0]
     shown = [cells for cells in shown if len(cells) == width]
@@ -177,6 +196,11 @@ def layout(rows: list[Row]) -> Layout:
     if at >= 0 and at < first - 1 and _length(rows[at].cells) == 1:
         at = -1
     below = [row for row in rows[at + 1 :] if not row.comment]
+    end = len(below)
+    while end and not fits(below[end - 1]) and _follows(below[end - 1], width):
+        end -= 1
+    summary = len(below) - end
+    del below[end:]
     names, units = numbered(width), [""] * width
     if at >= 0 and not (_length(rows[at].cells) == 1 < width):
         names, units, at = _named(rows, at, width)
@@ -199,7 +223,31 @@ def layout(rows: list[Row]) -> Layout:
             )
     whole = [Row(row.number, (row.cells + [""] * width)[:width]) for row in below]
     _refuse_thousands(whole, decimal)
-    return Layout(names, units, whole, decimal, sum(not row.comment for row in rows[: max(at, 0)]))
+    above = sum(not row.comment for row in rows[: max(at, 0)])
+    return Layout(names, units, whole, decimal, above, summary)
+
+
+def _timed(rows: list[Row]) -> list[Row]:
+    """Return rows with the time in the place of Rigol's numbers of samples: it has 'Start' and 'Increment' above."""
+    names, below = (row.cells for row in rows[:2]) if len(rows) > 1 else ([], [])
+    if names[:1] != ["X"] or "Increment" not in names or len(below) < len(names) - 1:
+        return rows
+    last = names.index("Increment") - 1
+    try:
+        start, increment = map(float, below[last : last + 2])
+        times = [repr(start + increment * float(row.cells[0])) for row in rows[2:]]
+    except ValueError:
+        return rows
+    head = [rows[0]._replace(cells=names[:last]), rows[1]._replace(cells=["s", *below[1:last]])]
+    data = [row._replace(cells=[t, *row.cells[1:last]]) for row, t in zip(rows[2:], times)]
+    return head + data
+
+
+def _follows(row: Row, width: int) -> bool:
+    """Tell whether a row at the end is none of the table: of a summary, or a sentence."""
+    words = list(filter(None, row.cells))
+    is_sentence = len(words) == 1 < width and " " in words[0]
+    return bool(SUMMARY.fullmatch(words[0])) or is_sentence
 
 
 def _decimal(shown: list[list[str]]) -> str:
@@ -233,14 +281,22 @@ def _refuse_thousands(rows: list[Row], decimal: str) -> None:
 
 def _named(rows: list[Row], at: int, width: int) -> tuple[list[str], list[str], int]:
     """Return names, units, and the index of the row of names, of words in row `at`: names, or units below them."""
+    names, units = (rows[at - 2].cells, rows[at - 1].cells) if at > 1 else ([], [])
+    if len(names) == len(units) > 1 and all(unit_of(word) in UNITS for word in units if word):
+        at -= 1  # what is left between the units and the numbers are Origin's comments
     words = rows[at].cells[: _length(rows[at].cells)]
     told = [unit_of(word) for word in words]
-    given = [unit in UNITS for unit, word in zip(told, words) if word]
-    if at and not rows[at - 1].comment and 2 * sum(given) >= len(given):
+    if at and not rows[at - 1].comment and _are_units(words):
         names = rows[at - 1].cells[: _length(rows[at - 1].cells)]
         told += [""] * len(names)
         return names, [unit or said_unit(name) for unit, name in zip(told, names)], at - 1
     return words, [said_unit(word) for word in words], at
+
+
+def _are_units(cells: list[str]) -> bool:
+    """Tell whether at least half of what is in cells are units."""
+    words = list(filter(None, cells))
+    return 2 * sum(unit_of(word) in UNITS for word in words) >= len(words)
 
 
 def _length(cells: list[str]) -> int:

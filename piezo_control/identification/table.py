@@ -7,7 +7,9 @@ Text (:mod:`piezo_control.identification.rows`), spreadsheets (.xlsx, the first 
 
 from __future__ import annotations
 
+import gzip
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,11 +20,29 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from piezo_control.identification.arrays import READERS, absent, read_vectors
-from piezo_control.identification.rows import MISSING, Row, layout, numbered, read_rows, with_points
-from piezo_control.identification.units import UNITS, said_unit, split_name, unit_of
-from piezo_control.safety import LARGEST_DEFLECTION
+from piezo_control.identification.rows import (
+    MISSING,
+    OVERLOAD,
+    Row,
+    layout,
+    numbered,
+    read_rows,
+    with_points,
+)
+from piezo_control.identification.units import UNITS, said_unit, si, split_name, unit_of
+from piezo_control.safety import HIGHEST_DEGC, LARGEST_DEFLECTION, LOWEST_DEGC
 
 LARGEST_MISSING_SHARE = 0.01  # of the rows
+OVERFLOW = (
+    9e36,
+    1e38,
+)  # 9.9e37 is IEEE 488.2's for a value beyond the range, 1e37 older instruments'
+DOUBTFUL = {
+    "temperature": (150.0, 500.0, "kelvin", "K"),
+    "time": (1e11, 1e19, "ms, us or ns since 1970", "ms"),
+}
+"""Between which a column that has no unit may be in another: no piezo is as warm, and 1e11 s are 3000 years."""
+GUESSED = "m", "mm", "um", "nm"  # picometres are always said
 GAINS = 0.02e-6, 50e-6  # m/V, of a small stack without a lever, and of a bender
 
 
@@ -81,13 +101,20 @@ class Table:
         unit = unit_of(unit) or self.units[index]
         if quantity == "time" and (clock := self._clock(index, unit)):
             return index, *clock
+        low, high, other, spelled = DOUBTFUL.get(quantity, (np.inf, np.inf, "", ""))
+        if not unit and low < self._median(index) < high:
+            raise TableError(
+                f"{self.path}: column '{self.headers[index]}' has numbers around {self._median(index):.4g} and no unit, "
+                f"which may be {other}: say it in the heading, as in '{quantity} [{spelled}]', or as in "
+                f"--{quantity} {index}:{spelled}"
+            )
         if (unit := unit or units[0]) not in units:
             option = f"--{quantity.replace('_', '-')} {index}:{units[0]}"
             raise TableError(
                 f"{self.path}: column '{self.headers[index]}' is in {unit}, '{quantity}' must be in one of "
                 f"{', '.join(units)}; where '{unit}' is wrong or no unit, say the unit, as in {option}"
             )
-        return index, unit, self.numbers(index) * UNITS[unit]
+        return index, unit, si(self.numbers(index), unit)
 
     def _parts(self, wanted: str | None, quantity: str) -> tuple[str, str]:
         """Return the name and the unit in NAME or NAME:UNIT; some names have a colon."""
@@ -131,6 +158,18 @@ class Table:
 
         Raises TableError for the first cell that is no number.
         """
+        values = self._numbers(index)
+        return np.where(_is_overflow(values), np.nan, values)
+
+    def overloaded(self, index: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell in which of the `rows` an instrument says that a value was beyond its range."""
+        cells = self.cells.iloc[rows, index]
+        if cells.dtype != object:
+            return _is_overflow(cells.to_numpy(float))
+        numbers = pd.to_numeric(with_points(cells, self.decimal), errors="coerce").to_numpy(float)
+        return cells.str.fullmatch(OVERLOAD).to_numpy(bool) | _is_overflow(numbers)
+
+    def _numbers(self, index: int) -> NDArray[np.float64]:
         column = self.cells.iloc[:, index]
         if column.dtype != object:
             return column.to_numpy(dtype=float)
@@ -147,6 +186,13 @@ class Table:
                 f"'{column.iloc[row]}', must be a finite number"
             )
         return values
+
+    def _median(self, index: int) -> float:
+        """Return the median of the numbers of a column; NaN where there are none."""
+        values = self.numbers(index)
+        return (
+            float(np.median(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
+        )
 
     def span(self, index: int) -> float:
         """Return how far the numbers of a column are apart; 0 where there are none."""
@@ -188,6 +234,10 @@ class Table:
         return form, (seconds - seconds.iloc[0]).reindex(column.index).to_numpy(float)
 
 
+def _is_overflow(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return (np.abs(values) >= OVERFLOW[0]) & (np.abs(values) <= OVERFLOW[1])
+
+
 @dataclass(frozen=True)
 class Columns:
     """Quantities of a table in SI units, each a 1-D array as long as `rows`, the numbers of the lines."""
@@ -221,8 +271,12 @@ def read_columns(
     wanted = ["time", *needed] if sample_time is None else needed
     table = read_table(path, {quantity: columns.get(quantity) for quantity in wanted})
     if table.headers == numbered(len(table.headers)) and not columns:
-        columns = _in_order(table, wanted, quantities)
-        table.form += ", without names: this order and these units assumed" if columns else ""
+        columns = _in_order(table, wanted)
+        if columns:
+            others = " ".join(f"--{q.replace('_', '-')} {place}" for q, place in columns.items())
+            table.form += (
+                f", without names: this order and these units assumed; {others} says so, or others"
+            )
     found = {
         quantity: table.find(quantity, columns.get(quantity), units)
         for quantity, units in quantities.items()
@@ -245,6 +299,9 @@ def read_columns(
     if sample_time is not None:
         values["time"] = sample_time * np.arange(len(table.rows))
     empty = np.any([np.isnan(column) for column in values.values()], axis=0)
+    without = np.flatnonzero(empty)
+    beyond = [table.overloaded(index, without) for index, *_ in places.values()]
+    overloads = int(np.any(beyond, axis=0).sum()) if without.size else 0
     if empty.sum() > LARGEST_MISSING_SHARE * empty.size:
         row = int(np.argmax(empty))
         index = next(i for q, (i, *_) in places.items() if np.isnan(values[q][row]))
@@ -252,6 +309,8 @@ def read_columns(
             f"{path}: column '{table.headers[index]}', row {table.rows[row]} is '{table.cells.iloc[row, index]}', must "
             f"be a finite number: {empty.sum()} of {empty.size} rows have an empty cell or no number in a column that "
             f"is needed, the first is row {table.rows[row]}; at most {LARGEST_MISSING_SHARE:.0%} may"
+            + f"; in {overloads} of them an instrument was out of its range"
+            * bool(overloads)
         )
     stroke = (
         float(np.ptp(values["deflection"][~empty]))
@@ -263,10 +322,18 @@ def read_columns(
             f"{path}: the deflection spans {stroke:g} m, must be at most {LARGEST_DEFLECTION:g} m: say its "
             "unit, as in --deflection COLUMN:um"
         )
+    degc = values.get("temperature", np.empty(0))
+    if (wild := np.flatnonzero((degc < LOWEST_DEGC) | (degc > HIGHEST_DEGC))).size:
+        index, unit, _ = places["temperature"]
+        raise TableError(
+            f"{path}: column '{table.headers[index]}', row {table.rows[wild[0]]} is {degc[wild[0]]:.5g}, must be within "
+            f"[{LOWEST_DEGC:g}, {HIGHEST_DEGC:g}] °C; read in {unit}: say another, as in --temperature {index}:degC"
+        )
     words = [f"{q} = column '{table.headers[i]}' [{unit}]" for q, (i, unit, _) in places.items()]
     if sample_time is not None:
         words.insert(0, f"time = rows {sample_time:g} s apart")
     left_out = f"; {empty.sum()} rows with empty cells left out" if empty.any() else ""
+    left_out += f", in {overloads} of which an instrument was out of its range" * bool(overloads)
     return Columns(
         {quantity: column[~empty] for quantity, column in values.items()},
         table.rows[~empty],
@@ -274,9 +341,7 @@ def read_columns(
     )
 
 
-def _in_order(
-    table: Table, wanted: Sequence[str], quantities: Mapping[str, tuple[str, ...]]
-) -> dict[str, str]:
+def _in_order(table: Table, wanted: Sequence[str]) -> dict[str, str]:
     """Return where the `wanted` quantities are in a table without names: in this order, if no column is left.
 
     A deflection is in the unit in which a finger moves that far under such voltages. Raises TableError where that
@@ -291,7 +356,7 @@ def _in_order(
         voltage = table.span(int(places["voltage"])) if "voltage" in places else 0.0
         possible = [
             unit
-            for unit in quantities["deflection"]
+            for unit in GUESSED
             if stroke * UNITS[unit] <= LARGEST_DEFLECTION
             and (not voltage or GAINS[0] <= stroke * UNITS[unit] / voltage <= GAINS[1])
         ]
@@ -302,7 +367,7 @@ def _in_order(
             )
             raise TableError(
                 f"{table.path}: no names, and a deflection that spans {stroke:g}{under} may be in "
-                f"{' or '.join(possible or quantities['deflection'])}: say its unit, as in {options}:um"
+                f"{' or '.join(possible or GUESSED)}: say its unit, as in {options}:um"
             )
         places["deflection"] += f":{possible[0]}"
     return places
@@ -319,9 +384,12 @@ def read_table(path: str | Path, wanted: Mapping[str, str | None] = MappingProxy
     if path.suffix.lower() == ".xlsx":
         return _read_sheet(path)
     try:
-        rows, form = read_rows(path.read_bytes())
-    except (OSError, ValueError) as error:
+        data = path.read_bytes()
+        rows, form = read_rows(gzip.decompress(data) if path.suffix.lower() == ".gz" else data)
+    except (gzip.BadGzipFile, ValueError, EOFError, zlib.error) as error:
         raise TableError(f"{path}: cannot be read as text: {error}") from None
+    except OSError as error:
+        raise TableError(f"{path}: cannot be read: {error.strerror}") from None
     return _table(path, rows, form)
 
 
@@ -334,6 +402,8 @@ def _table(path: Path, rows: list[Row], form: str) -> Table:
         raise TableError(f"{path}: {error}") from None
     if found.above:
         form += f", {found.above} rows above the names passed over"
+    if found.below:
+        form += f", {found.below} rows of words or of a summary at the end left out"
     if found.decimal == ",":
         form += ", decimal commas"
     cells = pd.DataFrame(

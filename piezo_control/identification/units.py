@@ -5,24 +5,32 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
+from numpy.typing import NDArray
+
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0,
     "V": 1.0, "mV": 1e-3, "kV": 1e3,
-    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9,
+    "m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12,
     "N": 1.0, "mN": 1e-3, "uN": 1e-6,
-    "degc": 1.0,
+    "degc": 1.0, "kelvin": 1.0, "degf": 5.0 / 9.0,
 }  # fmt: skip
-"""Units that are understood, with what makes SI (°C for temperature) of them."""
+"""Units that are understood, with what makes SI (°C for temperature) of them, beside ZEROS."""
+ZEROS = {"kelvin": 273.15, "degf": 32.0}
+"""Where 0 °C is."""
 
-SPELLINGS = {"µ": "u", "μ": "u", "°C": "degc", "℃": "degc", "degC": "degc"}
+SPELLINGS = {
+    "µ": "u", "μ": "u", "°C": "degc", "℃": "degc", "degC": "degc", "°K": "kelvin", "°F": "degf", "℉": "degf",
+}  # fmt: skip
 # Capitals are overlooked in words only: 'Nm' is no nanometre, 'MV' no millivolt.
 SYMBOLS = {unit.lower(): unit for unit in UNITS} | {unit: unit for unit in UNITS}
+SYMBOLS |= {"K": "kelvin", "F": "degf"}
 WORDS = {
-    "c": "degc", "celsius": "degc", "sec": "s", "second": "s", "msec": "ms", "millisec": "ms", "millisecond": "ms",
+    "c": "degc", "celsius": "degc", "degk": "kelvin", "kelvin": "kelvin", "fahrenheit": "degf", "sec": "s", "second": "s", "msec": "ms", "millisec": "ms", "millisecond": "ms",
     "usec": "us", "microsec": "us", "microsecond": "us", "min": "min", "minute": "min", "hr": "h", "hour": "h",
-    "mm:ss": "min", "hh:mm": "h", "volt": "V", "millivolt": "mV", "kilovolt": "kV", "meter": "m", "metre": "m",
+    "mm:ss": "min", "hh:mm": "h", "volt": "V", "vdc": "V", "millivolt": "mV", "kilovolt": "kV", "meter": "m", "metre": "m",
     "millimeter": "mm", "millimetre": "mm", "micrometer": "um", "micrometre": "um", "micron": "um",
-    "nanometer": "nm", "nanometre": "nm", "newton": "N", "millinewton": "mN", "micronewton": "uN",
+    "nanometer": "nm", "nanometre": "nm", "picometer": "pm", "picometre": "pm", "newton": "N", "millinewton": "mN", "micronewton": "uN",
 }  # fmt: skip
 """Of a clock, the unit before the colon."""
 
@@ -30,9 +38,15 @@ BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*")
 BEHIND = re.compile(r"(.+?)(?:\s*[/,]\s*|_|\s+(?:in\s+)?(?![cC]\s*$))([^\s_/,]+)\s*")
 LIKE_UNIT = re.compile(
     r"(?i:([pnuµμmcdk]|nano|micro|milli|centi|kilo|mega)(s|sec|second|m|met(er|re)|v|volt|n|newton|g|gf|hz)s?"
-    r"|days?|inch(es)?|mils?|hz|°f|degf|fahrenheit|degk|kelvin|counts?|lsb|percent)|%|K|F"
+    r"|days?|inch(es)?|mils?|hz|counts?|lsb|percent)|%"
 )
 """What ends a heading as a unit does, be it one of UNITS or not."""
+
+
+def si(values: NDArray[np.float64], unit: str) -> NDArray[np.float64]:
+    """Return values in one of UNITS in SI, °C for temperature."""
+    zero = ZEROS.get(unit, 0.0)
+    return (values - zero if zero else values) * UNITS[unit]
 
 
 def unit_of(text: str) -> str:

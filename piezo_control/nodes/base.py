@@ -111,7 +111,7 @@ class FingerNode(LifecycleNode):
             else:
                 value = list(default) if isinstance(default, tuple) else default
                 self.declare_parameter(name, value, describe(name, kind, field))
-        self.parameters: Any = build(self.PARAMETERS, self._values({}), self.NAME)
+        self.parameters: Any = build(self.PARAMETERS, self._values({}))
         self.active = False
         self._said = ""
         self._refused, self._refusal = 0, ""
@@ -350,12 +350,11 @@ def run(*node_types: type[FingerNode]) -> int:
         for node_type in node_types:
             nodes.append(node_type())
         refuse_unknown(nodes)
-        for flag, path in zip(sys.argv, sys.argv[1:]):
-            if flag == "--params-file":  # rcl passes over one for other nodes without a word
-                need_one_for(path, [node.get_fully_qualified_name() for node in nodes])
-                for node in nodes:
-                    if is_for(path, node.get_fully_qualified_name()):
-                        node.comes_from("parameters", path)
+        for path in parameter_files():  # rcl passes over one for other nodes without a word
+            need_one_for(path, [node.get_fully_qualified_name() for node in nodes])
+            for node in nodes:
+                if is_for(path, node.get_fully_qualified_name()):
+                    node.comes_from("parameters", path)
         for node in nodes:
             if node.get_parameter("autostart").value:
                 if node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
@@ -364,7 +363,10 @@ def run(*node_types: type[FingerNode]) -> int:
                 node.say("waits to be configured and activated, as by `fingerctl lifecycle`")
         spin.spin(nodes, stop.is_set)
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
-        print(f"{node_types[min(len(nodes), len(node_types) - 1)].NAME}: {error}", file=sys.stderr)
+        name, text = node_types[min(len(nodes), len(node_types) - 1)].NAME, str(error)
+        if files := [path for path in parameter_files() if path not in text]:
+            text += f"; parameters come from {', '.join([*files, *{'-p'} & set(sys.argv)])}"
+        print(f"{name}: {text}", file=sys.stderr)
         return 2
     except (RCLError, RCLInvalidROSArgsError, UnknownROSArgsError) as error:
         # A parameter file or an argument that rcl cannot read; its first line names it.
@@ -376,6 +378,12 @@ def run(*node_types: type[FingerNode]) -> int:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def parameter_files() -> list[str]:
+    """Return the parameter files that the command line names."""
+    words = zip(sys.argv, sys.argv[1:])
+    return [path for flag, path in words if flag == "--params-file"]
 
 
 def refuse_unknown(nodes: Sequence[FingerNode]) -> None:

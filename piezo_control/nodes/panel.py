@@ -24,6 +24,7 @@ from typing import Any
 
 from bokeh.application import Application
 from bokeh.application.handlers import FunctionHandler
+from bokeh.server.connection import ServerConnection
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
@@ -276,6 +277,14 @@ def main() -> int:
     return 0
 
 
+class Pages(BokehTornado):
+    """Bokeh's server of pages, which asks one that it has given up for its session when the browser closes it."""
+
+    def client_lost(self, connection: ServerConnection) -> None:
+        super().client_lost(connection)
+        connection._socket.connection = None  # what it is told of its end from now on is no news
+
+
 def serve(bench: Bench, host: str, port: int, loop: IOLoop) -> BaseServer:
     """Return a server of the page of `bench`; it listens only to pages that it has sent itself.
 
@@ -285,7 +294,7 @@ def serve(bench: Bench, host: str, port: int, loop: IOLoop) -> BaseServer:
     names = {host, "localhost", "127.0.0.1"} if host in LOCAL else {host}
     port = sockets[0].getsockname()[1]
     page = Application(FunctionHandler(partial(build, bench=bench)))
-    application = BokehTornado({"/": page}, extra_websocket_origins=[f"{n}:{port}" for n in names])
+    application = Pages({"/": page}, extra_websocket_origins=[f"{n}:{port}" for n in names])
     http = HTTPServer(application)
     http.add_sockets(sockets)
     return BaseServer(loop, application, http)

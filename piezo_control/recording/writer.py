@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from rosbags.interfaces import (
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from piezo_control.files import why_not
 from piezo_control.profile import Profile
 from piezo_control.recording.reader import BagError, open_bag
 from piezo_control.recording.recording import (
@@ -59,8 +61,10 @@ class BagWriter:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        if self.path.exists():
+        if os.path.exists(path):  # Path.exists raises OSError for a name that no file can have
             raise ValueError(f"'bag' is '{path}', which exists; name a new folder")
+        if reason := why_not(str(path), is_folder=True):
+            raise ValueError(f"'bag' is {str(path)!r}: it {reason}")
         self.typestore = get_typestore(Stores.ROS2_JAZZY)
         self.learn("piezo_gripper_msgs", shared_folder() / "msg_defs")
         self._writer = Writer(self.path, version=9, storage_plugin=StoragePlugin.MCAP)

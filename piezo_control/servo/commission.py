@@ -48,7 +48,7 @@ from piezo_control.identification.hysteresis import (  # noqa: E402
     settled,
 )
 from piezo_control.identification.measurement import Measurement, MeasurementError  # noqa: E402
-from piezo_control.options import within  # noqa: E402
+from piezo_control.options import output_folder, within  # noqa: E402
 from piezo_control.parameters import ParameterError, build, dump, flatten  # noqa: E402
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import FAULT, LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
@@ -373,6 +373,9 @@ def main() -> int:
     except (NoAnswer, MeasurementError, SynthesisError) as error:
         print(f"commission: {error}", file=sys.stderr)
         return 1
+    except EOFError:
+        print("commission: nobody is there to answer; --yes asks nothing", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("commission: ended by a signal; the voltage is led to rest", file=sys.stderr)
         return 1
@@ -442,7 +445,7 @@ def parse() -> argparse.Namespace:
         "--problem", type=Path,
         help="design problem (that of `robust`, which leaves a finger that is slower than the paper's more time)",
     )  # fmt: skip
-    parser.add_argument("--out", type=Path, default=Path("commissioned"), help="(%(default)s)")
+    parser.add_argument("--out", type=output_folder, default="commissioned", help="(%(default)s)")
     parser.add_argument("--overwrite", action="store_true", help="replace what is in --out")
     parser.add_argument("--yes", action="store_true", help="do not ask before each step")
     return parser.parse_args()

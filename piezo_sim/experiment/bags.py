@@ -13,9 +13,9 @@ from piezo_control.identification.columns import LOOP
 from piezo_control.identification.measurement import is_bag, places
 from piezo_control.identification.table import TableError, read_columns
 from piezo_control.recording.recording import BagError, Recording, read
+from piezo_control.report.page import Section
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import Figures, analyse, classify, steps
-from piezo_sim.experiment.report import Section
 from piezo_sim.experiment.results import CAPTIONS, HEADINGS, definitions, table
 
 

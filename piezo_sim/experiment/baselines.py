@@ -21,9 +21,9 @@ from piezo_control.feedback import read_controller
 from piezo_control.metrics import step_metrics
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording, read
+from piezo_control.report.page import Section
 from piezo_sim.experiment.cases import Case, params_folder
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import Section
 from piezo_sim.plant.sensor import SensorParameters
 
 CONTROLLERS = ("paper", "robust", "fast", "integrator_notch", "pid")

@@ -42,9 +42,9 @@ COMPENSATORS = {
     "open_loop": "static_gain",
     "feedforward": "inverse",
     "sensorless": "sensorless",
-    "feedback": "inverse",
+    "feedback": "",
 }
-"""Mode of a case to compensator of its feedforward."""
+"""Mode of a case to compensator of its feedforward; empty: that of the parameter file, or the inverse."""
 HOLDING = ("thermal", "force")
 """Analyses that need no motion."""
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
@@ -116,12 +116,15 @@ class Case:
     def parameters(self, bag: Path | None = None) -> dict[str, Any]:
         """Return the parameter dataclass of every node for this run."""
         grid = max(1e-3, self.sample_time)
+        given = {n: own_parameters(self.params, n) for n in NODES}
+        compensator = COMPENSATORS[self.mode] or given["feedforward"].get("compensator", "inverse")
+        is_warm = compensator == "sensorless"
         changes: dict[str, dict[str, Any]] = {
             "feedforward": {
                 "subscribers": 2,
                 "sample_time": self.sample_time,
-                "compensator": COMPENSATORS[self.mode],
-                "temperature_lockstep": self.mode == "sensorless",
+                "compensator": compensator,
+                "temperature_lockstep": is_warm,
                 "temperature_period": grid,
                 # Without feedback the paper's steps are as steep as the amplifier goes.
                 **(
@@ -132,7 +135,7 @@ class Case:
             },
             "feedback": {"subscribers": 2},
             "temperature": {
-                "subscribers": 3 if self.mode == "sensorless" else 2,
+                "subscribers": 3 if is_warm else 2,
                 "period": grid,
                 "ahead": 20 * grid,
                 **self.temperature,
@@ -148,7 +151,6 @@ class Case:
                 "clock_period": 10 * grid,
             },
         }
-        given = {n: own_parameters(self.params, n) for n in NODES}
         if self.mode == "feedback":
             given["feedback"] = flatten(read_controller(self.controller, self.params))
             if self.preview_band:

@@ -18,13 +18,14 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from piezo_control.identification.columns import LOOP, add_options, chosen_columns
+from piezo_control.options import output_folder
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
+from piezo_control.report.page import Section, print_table, write_html
 from piezo_control.start import interrupt_at_signals
 from piezo_sim.experiment.analysis import ANALYSES
 from piezo_sim.experiment.cases import Case, CaseRun, RunFailed, not_covered, read_experiment
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import Section, print_table, write_html
 from piezo_sim.experiment.study import results_folder
 
 EXPERIMENTS = {
@@ -229,12 +230,16 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser("recover", help=text, description=f"{text.capitalize()}.")
     command.set_defaults(run_command=run_recover, command="recover")
     command.add_argument("bags", type=Path, nargs="+", metavar="BAG", help="rosbag2 folders")
-    command.add_argument("--out", type=Path, help="new folder for the bags (default: out/recover)")
+    command.add_argument(
+        "--out", type=output_folder, help="new folder for the bags (default: out/recover)"
+    )
     return main_parser
 
 
 def _add_experiment_options(command: argparse.ArgumentParser, name: str) -> None:
-    command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
+    command.add_argument(
+        "--out", type=output_folder, help=f"folder for the results (default: out/{name})"
+    )
     command.add_argument("--overwrite", action="store_true", help="replace results in --out")
     command.add_argument(
         "--namespace", type=namespace, default="finger", help="namespace of the nodes"
@@ -269,7 +274,9 @@ def _add_bag_options(command: argparse.ArgumentParser, name: str, least: str) ->
         "bags", type=Path, nargs="+", metavar="RECORDING",
         help=f"{least} rosbag2 folders, .mcap or .db3 files, or tables",
     )  # fmt: skip
-    command.add_argument("--out", type=Path, help=f"folder for the results (default: out/{name})")
+    command.add_argument(
+        "--out", type=output_folder, help=f"folder for the results (default: out/{name})"
+    )
     command.add_argument(
         "--as",
         dest="kind",

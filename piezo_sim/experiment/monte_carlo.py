@@ -23,6 +23,7 @@ import numpy as np
 from piezo_control.feedback import FeedbackParameters, read_controller, uncovered
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.metrics import StepMetrics, step_metrics
+from piezo_control.options import output_folder
 from piezo_control.parameters import ParameterError, build
 from piezo_control.profile import Profile
 from piezo_control.thermal import REFERENCE_DEGC
@@ -183,7 +184,10 @@ def main(arguments: list[str] | None = None) -> int:
         "controller", help="name of a shipped controller, or parameter file of the node 'feedback'"
     )
     parser.add_argument(
-        "--out", default="out/monte_carlo", help="folder; started again, it goes on"
+        "--out",
+        type=output_folder,
+        default="out/monte_carlo",
+        help="folder; started again, it goes on",
     )
     parser.add_argument("--draws", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)

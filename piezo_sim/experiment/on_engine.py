@@ -21,7 +21,12 @@ def run_on_engine(case: Case, out: Path, finger: str, progress: Progress) -> Cas
     begin = time.monotonic()
     temperature, tip_force = parameters["temperature"], case.tip_force
     plant, feedforward = parameters["cantilever"], parameters["feedforward"]
-    if case.mode == "sensorless":
+    if feedforward.compensator == "sensorless" and case.mode == "feedback":
+        made, _ = engine.run_led(
+            plant, parameters["feedback"], feedforward, temperature, case.reference, case.samples,
+            case.samples, tip_force, case.every,
+        )  # fmt: skip
+    elif feedforward.compensator == "sensorless":
         made = engine.run_sensorless(
             plant, feedforward, temperature, case.reference, case.samples, tip_force, case.every
         )

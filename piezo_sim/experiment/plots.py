@@ -22,7 +22,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from piezo_control.metrics import last_cycle  # noqa: E402
 from piezo_control.recording.recording import Recording  # noqa: E402
-from piezo_sim.experiment import zoom  # noqa: E402
+from piezo_control.report import pictures  # noqa: E402
 from piezo_sim.experiment.analysis import frequency_response  # noqa: E402
 
 Lines = Mapping[str, Sequence[Recording]]
@@ -33,7 +33,6 @@ COOL, WARM = "tab:blue", "tab:red"
 OTHERS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:pink")
 WARM_FROM = 27.0  # °C
 HELD = 0.02  # s before a disturbance over which the held deflection is averaged
-DOTS_PER_INCH = 110
 
 
 def transient(panels: Panels, path: Path) -> Path:
@@ -228,9 +227,6 @@ def _finish(axes: Sequence[Axes], x: str, y: str, legend: str = "best") -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write the figure as PNG, its curves beside it for who wants to zoom, and free it."""
-    figure.savefig(path, dpi=DOTS_PER_INCH)
-    if zoom.HAS_BOKEH:
-        zoom.write_plot(figure, path)
+    """Write the figure as :func:`pictures.save` does, and free it."""
     plt.close(figure)
-    return path
+    return pictures.save(figure, path)

@@ -13,10 +13,10 @@ import numpy as np
 from piezo_control.files import write_json
 from piezo_control.parameters import flatten, provenance
 from piezo_control.recording.recording import BagError, Recording, read
+from piezo_control.report.page import Section, cell
 from piezo_sim.experiment import plots
 from piezo_sim.experiment.analysis import QUANTITIES, Figures, analyse
 from piezo_sim.experiment.cases import NODES, Case, CaseRun, parameter_files
-from piezo_sim.experiment.report import Section, cell
 
 MODE_TITLES = {
     "open_loop": "open loop (static gain)",

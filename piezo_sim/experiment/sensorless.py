@@ -29,15 +29,15 @@ from piezo_control.nodes.parameters import FeedforwardNodeParameters
 from piezo_control.parameters import build, dump, flatten, load
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording, read
+from piezo_control.report.page import Section
 from piezo_control.sensorless import SensorlessParameters
-from piezo_control.shaping import ShapingParameters, delay, shaper
+from piezo_control.shaping import ShapingParameters, ahead, shaper
 from piezo_control.thermal import ThermalParameters
 from piezo_sim.experiment import plots
 from piezo_sim.experiment import study as command_line
 from piezo_sim.experiment.cases import Case, RunFailed, read_experiment
 from piezo_sim.experiment.cli import run_all
 from piezo_sim.experiment.on_engine import run_on_engine
-from piezo_sim.experiment.report import Section
 from piezo_sim.plant.sensor import SensorParameters
 
 PLANTS = ("prandtl_ishlinskii", "truth")
@@ -116,10 +116,10 @@ class Task:
         """Return the run in `mode`, with the parameter files in `folder`."""
         is_slow = self.is_slow and mode == "sensorless"
         sample_time = SLOW if is_slow else SAMPLE_TIME
-        ahead = 0.0
+        reference = self.wanted
         if self.is_known_ahead and mode == "sensorless":
             taps = shaper(models.shaping, models.dynamics.denominator, sample_time)
-            ahead = delay(taps, sample_time) + sample_time  # of the held sample
+            reference = ahead(self.wanted, self.begin, self.duration, taps, sample_time)
         return Case(
             name=f"{folder.name}_{self.name}",
             mode=mode,
@@ -127,7 +127,7 @@ class Task:
             plant=folder.parent.name,
             sample_time=sample_time,
             duration=self.duration,
-            reference=Profile(self.wanted.time - ahead, self.wanted.value, linear=True),
+            reference=reference,
             tip_force=NO_FORCE,
             temperature=self.temperature,
             experiment="sensorless",

@@ -15,10 +15,11 @@ from typing import Any
 from rich.console import Console
 
 from piezo_control.files import write_json
+from piezo_control.options import output_folder
 from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import BagError
+from piezo_control.report.page import Section, print_table, write_html
 from piezo_sim.experiment.cases import RunFailed
-from piezo_sim.experiment.report import Section, print_table, write_html
 
 Work = Callable[[argparse.Namespace, Path, Console], tuple[dict[str, Any], Sequence[Section]]]
 """Does a study into a folder; returns what metrics.json and the report shall hold."""
@@ -31,7 +32,7 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
         prog=f"python -m {module}", description=description.splitlines()[0]
     )
     made.add_argument(
-        "--out", type=Path, default=Path("out", name), metavar="DIR", help="(%(default)s)"
+        "--out", type=output_folder, default=f"out/{name}", metavar="DIR", help="(%(default)s)"
     )
     made.add_argument("--overwrite", action="store_true", help="replace results in --out")
     return made

@@ -31,7 +31,8 @@ from piezo_control.hysteresis import (
     Coefficients,
     HysteresisParameters,
     State,
-    coefficients,
+    at_rest,
+    from_rest,
     operator_step,
 )
 from piezo_control.parameters import group, parameter
@@ -112,7 +113,7 @@ def model(parameters: CantileverParameters) -> CantileverModel:
     """Return the sampled model of the cantilever."""
     p = parameters
     h = p.sample_time
-    operator = coefficients(p.hysteresis, h)
+    operator = from_rest(p.hysteresis, h)
     bouc_wen = BoucWen(p.truth.slope, p.truth.alpha, p.truth.beta, p.truth.gamma)
     is_truth = p.plant == "truth"
     if is_truth:
@@ -122,7 +123,7 @@ def model(parameters: CantileverParameters) -> CantileverModel:
         gain_per_degc = p.truth.creep_per_decade_degc * per_neper
         times, shares = creep.logarithmic(p.truth.creep_onset, p.truth.creep_last)
     else:
-        slope = sum(operator.weights)
+        slope = sum(p.hysteresis.weights)
         gain, gain_per_degc = p.creep.gain, p.creep.gain_per_degc
         times, shares = np.array(p.creep.times), np.array(p.creep.shares)
     return CantileverModel(
@@ -188,7 +189,7 @@ def rest(m: CantileverModel, delay_samples: int, temperature_degc: float) -> Can
     voltage = m.amplifier.rest
     state = CantileverState(
         amplifier=AmplifierState(voltage=[voltage], clipped=[0.0]),
-        hysteresis=State([0.0] * len(m.operator.weights), voltage=[0.0], voltage_step=[0.0]),
+        hysteresis=at_rest(m.operator),
         bouc_wen=BoucWenState(lag=[0.0], voltage=[0.0]),
         body=Body([temperature_degc], degc_at_start=[temperature_degc]),
         relaxations=[0.0] * len(m.creep.retained),

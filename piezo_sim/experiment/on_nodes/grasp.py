@@ -25,13 +25,13 @@ from piezo_control.dynamics import DynamicsParameters
 from piezo_control.nodes.client import ClientError, Finger, Gripper, connect
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import SAMPLE_TYPE, Recording, read
+from piezo_control.report.page import Section
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
 from piezo_sim.experiment.on_nodes.conductor import need_free
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 from piezo_sim.experiment.plots import save
-from piezo_sim.experiment.report import Section
 from piezo_sim.plant.cantilever import CantileverParameters
 
 SIDES = ("left", "right")

@@ -26,12 +26,13 @@ from piezo_control.nodes import spin
 from piezo_control.profile import Profile
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import BLOCK_TYPE, Recording, read
+from piezo_control.report.page import Section
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
 from piezo_sim.experiment.on_nodes.conductor import Conductor, need_free
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
-from piezo_sim.experiment.report import Section
+from piezo_sim.experiment.plots import save
 
 STEP = 20e-6  # m
 LEAD = 0.2  # s from the order to the step
@@ -147,9 +148,7 @@ def draw(recording: Recording, late: np.ndarray, path: Path) -> Path:
     jitter.hist(np.clip(1e6 * late, 0.0, 100.0), 100, histtype="step", log=True)
     jitter.set(xlabel="late by [µs], 100 and more in the last bin", ylabel="periods")
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    return path
+    return save(figure, path)
 
 
 def work(

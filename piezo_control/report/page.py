@@ -23,8 +23,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from piezo_control.files import replaced
+from piezo_control.report.pictures import plot_file
 from piezo_control.shared import version
-from piezo_sim.experiment.zoom import plot_file
 
 GAP = 2  # blanks between the columns of a table
 EDGES = 2  # blanks around it
@@ -54,11 +54,11 @@ def write_html(
     sections: Iterable[Section],
     verdict: Sequence[str] = (),
     footer: str = "",
-) -> None:
-    """Write `verdict`, in sentences, and `sections` as one HTML file with the pictures inside."""
-    environment = Environment(loader=PackageLoader("piezo_sim.experiment", "."), autoescape=True)
+) -> Path:
+    """Write `verdict`, in sentences, and `sections` as one HTML file with the pictures inside; return its path."""
+    environment = Environment(loader=PackageLoader("piezo_control.report", "."), autoescape=True)
     environment.filters["is_text"] = is_text
-    template = environment.get_template("report.html.j2")
+    template = environment.get_template("page.html.j2")
     pages: list[dict[str, Any]] = [
         {
             "title": section.title,
@@ -88,6 +88,7 @@ def write_html(
     text = template.render(title=title, sections=pages, verdict=verdict, footer=footer, **origin)
     with replaced(path) as (place,):
         place.write_text(text)
+    return path
 
 
 def _plot(picture: Path) -> str:
