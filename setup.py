@@ -78,8 +78,9 @@ setup(
         "cluster": ["distributed"],  # `monte_carlo --scheduler`
         "formats": ["fastparquet", "h5py", "npTDMS", "openpyxl"],  # recordings of other instruments
         "panel": ["bokeh"],  # `panel`
-        "fast": ["numba"],  # no rosdep key: without it the engine runs as Python, slowly
-        "synthesis": ["slycot"],  # GPL-2.0: needed by `synthesize` alone
+        # No rosdep key. `servo`, `commission` and `udp_finger` need it; the engine runs without, as Python, slowly.
+        "fast": ["numba"],
+        "synthesis": ["slycot"],  # GPL-2.0; its rosdep rule would put NumPy 2 over Jazzy's NumPy 1
         "test": [
             "control",
             "coverage",

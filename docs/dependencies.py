@@ -22,7 +22,8 @@ Written by `python docs/dependencies.py` from what is installed. The package its
 does without [slycot](https://github.com/python-control/Slycot), which is GPL-2.0: `synthesize` and `commission` import it
 for a design from weights (method `hinf`), nothing else does. Who gives away a program together with slycot has to heed
 the GPL; a controller file that came out of it is data. The methods that need no weights (`damped_integrator`, `pid`,
-`integrator_notch`) need no slycot.
+`integrator_notch`) need no slycot. Install it by `pip install --no-deps slycot`: it asks for NumPy 2 and runs on 1.26, and
+NumPy 2 would break the scipy, pandas and matplotlib of ROS 2 Jazzy.
 
 Recordings of other programs are read by [h5py](https://www.h5py.org/) (HDF5, MATLAB 7.3),
 [npTDMS](https://nptdms.readthedocs.io/) (LabVIEW; LGPL-3.0), [fastparquet](https://fastparquet.readthedocs.io/) and

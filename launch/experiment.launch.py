@@ -9,9 +9,11 @@ itself; who records beside it loses nothing with
 import shlex
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction
+from launch.actions import ExecuteProcess, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackagePrefix
+
+from piezo_control.nodes import launched
 
 ARGUMENTS = {
     "experiment": ("step", "name of the experiment, as `experiment --help` lists them"),
@@ -30,12 +32,4 @@ def command(context: LaunchContext) -> list[ExecuteProcess]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(argument, default_value=value, description=text)
-                for argument, (value, text) in ARGUMENTS.items()
-            ),
-            OpaqueFunction(function=command),
-        ]
-    )
+    return LaunchDescription([*launched.declared(ARGUMENTS), OpaqueFunction(function=command)])

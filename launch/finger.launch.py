@@ -9,7 +9,7 @@ and the topics; without the file rosbag2 loses samples (docs/recordings.md).
 """
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -25,9 +25,7 @@ ARGUMENTS = launched.ARGUMENTS | {
     "force_control": ("false", "feel and limit the force, in place of the controller (docs/touch.md)"),
     "state_period": ("0.1", "how often the finger's state is published, in s"),
 }  # fmt: skip
-CHOICES = {"plant": ["simulated", "none"], "mode": ["lockstep", "free_running"]} | {
-    name: launched.SWITCH for name, (default, _) in ARGUMENTS.items() if default in launched.SWITCH
-}
+CHOICES = {"plant": ["simulated", "none"], "mode": ["lockstep", "free_running"]}
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -55,13 +53,5 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(
-                    name, default_value=value, description=text, choices=CHOICES.get(name)
-                )
-                for name, (value, text) in ARGUMENTS.items()
-            ),
-            OpaqueFunction(function=nodes),
-        ]
+        [*launched.declared(ARGUMENTS, **CHOICES), OpaqueFunction(function=nodes)]
     )

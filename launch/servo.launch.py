@@ -9,7 +9,7 @@ and the topics; without the file rosbag2 loses samples (docs/recordings.md).
 """
 
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -36,9 +36,6 @@ ARGUMENTS = (
     | {"params": ("", "parameter file, such as the servo.yaml that `commission` writes")}
     | {name: ("", text) for name, (_, text) in OF_THE_SERVO.items()}
 )
-CHOICES = {
-    name: launched.SWITCH for name, (default, _) in ARGUMENTS.items() if default in launched.SWITCH
-}
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -53,14 +50,4 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription(
-        [
-            *(
-                DeclareLaunchArgument(
-                    name, default_value=value, description=text, choices=CHOICES.get(name)
-                )
-                for name, (value, text) in ARGUMENTS.items()
-            ),
-            OpaqueFunction(function=nodes),
-        ]
-    )
+    return LaunchDescription([*launched.declared(ARGUMENTS), OpaqueFunction(function=nodes)])

@@ -5,15 +5,25 @@ from __future__ import annotations
 
 import atexit
 import importlib
+import re
 import signal
 import sys
 import time
 from collections.abc import Callable
+from importlib.metadata import requires
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+# What comes with another package, or is called otherwise there.
+PART_OF = {
+    "llvmlite": "numba",
+    "lz4": "rosbags",
+    "tornado": "bokeh",
+    "yaml": "pyyaml",
+    "zstandard": "rosbags",
+}
 LOOK_PERIOD = 0.02  # s, between two looks at whether a signal came
 
 
@@ -73,11 +83,23 @@ def stop_at_signals() -> Stop:
     return stop
 
 
+def how_to_get(package: str) -> str:
+    """Return in a few words how a Python package gets here that one of the programs imports."""
+    package = PART_OF.get(package, package)
+    declared = [re.split(r"[^\w.-]", line)[0].lower() for line in requires("piezo_gripper") or []]
+    if package in declared:
+        return f"needs {package}: pip install {package}"
+    return (
+        f"needs {package}: source the setup.bash of ROS 2 Jazzy and of the workspace, or that of a "
+        "checkout after 'make env'"
+    )
+
+
 def executable(module: str) -> Callable[[], int]:
     """Return a function that imports `module` and runs its `main`.
 
-    What the machine refuses, such as a full disk, is said in a line, with exit code 1; letters that the terminal does
-    not have, such as µ, stand there as '?'.
+    What is missing or what the machine refuses, a package or a full disk, is said in a line, with exit code 1; letters that
+    the terminal does not have, such as µ, stand there as '?'.
     """
 
     def start() -> int:
@@ -87,9 +109,14 @@ def executable(module: str) -> Callable[[], int]:
             sys.stdout.reconfigure(errors="replace")
         try:
             return importlib.import_module(module).main()
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package in ("", "piezo_control", "piezo_sim"):
+                raise
+            print(f"{Path(sys.argv[0]).name}: {how_to_get(package)}", file=sys.stderr)
         except OSError as error:
             print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
-            return 1
+        return 1
 
     return start
 

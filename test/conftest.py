@@ -2,9 +2,17 @@
 """Every test session has a ROS domain of its own and stays on this machine."""
 
 import os
+import shutil
 import signal
 
 import own_domain
+import pytest
+
+CHROMIUM = shutil.which("chromium")
+FLAGS = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
 
 own_domain.take()
 
@@ -22,3 +30,14 @@ def pytest_configure(config):
         "markers",
         "shows(row, ...): rows of the table of faults in docs/safety.md that a test shows",
     )
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if CHROMIUM is None:
+        pytest.skip("no chromium on this machine (apt install chromium)")
+    playwright = pytest.importorskip("playwright.sync_api", reason="installed where chromium is")
+    with playwright.sync_playwright() as p:
+        chromium = p.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
+        yield chromium
+        chromium.close()

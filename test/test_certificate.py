@@ -13,6 +13,7 @@ import control
 import numpy as np
 import pytest
 import yaml
+from weights import FAST, needs_slycot
 
 from piezo_control.design import hinf, state_space
 from piezo_control.design.certificate import (
@@ -52,6 +53,7 @@ def paper_setting() -> DesignProblem:
 # Norms ------------------------------------------------------------------------------------------
 
 
+@needs_slycot
 def test_weighted_norm_equals_that_of_the_interconnection_in_python_control():
     p = problem("fast")
     step = p.finger.sample_time / state_space.TIME_UNIT
@@ -73,6 +75,7 @@ def test_weighted_norm_equals_that_of_the_interconnection_in_python_control():
     assert weighted_norms(p, c)["all"] == pytest.approx(expected, rel=1e-4)
 
 
+@needs_slycot
 def test_the_papers_norm_is_not_its_gamma():
     # |[W1 S, W1 S W2]| with W2 = 1 is sqrt 2 |W1 S|, in continuous time by python-control; the paper
     # says gamma = 4.
@@ -104,6 +107,7 @@ def test_norms_of_an_unstable_loop_are_infinite():
 # Claims -----------------------------------------------------------------------------------------
 
 
+@needs_slycot
 @pytest.mark.parametrize("factor", [0.07, 0.5, 2.0, 100.0])
 def test_a_falsified_gamma_is_found_out(factor):
     design = synthesize(problem("fast"))
@@ -114,6 +118,7 @@ def test_a_falsified_gamma_is_found_out(factor):
     ]
 
 
+@needs_slycot
 def test_junk_from_the_solver_is_found_out():
     # python-control's hinfsyn has reported a gamma of 0.065 for a loop with a norm of 2.1e3. A controller
     # that does not fit its claim must fail, whatever it claims.
@@ -145,6 +150,7 @@ def test_the_papers_controller_in_the_papers_setting():
     assert "resonance -20 %" in failed["poles with resonance further off"].at
 
 
+@needs_slycot
 def test_the_papers_weights_give_the_behaviour_of_its_controller():
     p = problem("paper_weights")
     design = synthesize(p)
@@ -161,6 +167,7 @@ def test_the_papers_weights_give_the_behaviour_of_its_controller():
 # Shipped controllers ----------------------------------------------------------------------------
 
 
+@needs_slycot
 def test_fast_meets_everything_at_once():
     # What a brute-force integrator with roll-off and broad notch
     # reaches in the worst case over resonance ±10 %, damping x0.5 to x2 and gain ±10 %.
@@ -180,7 +187,7 @@ def test_fast_meets_everything_at_once():
 @pytest.mark.parametrize(
     "name",
     [
-        "fast", "robust", "robust_delay_2", "robust_delay_3", "pid", "integrator_notch",
+        FAST, "robust", "robust_delay_2", "robust_delay_3", "pid", "integrator_notch",
         "following", "following_adapted",
     ],
 )  # fmt: skip
@@ -235,6 +242,7 @@ def test_worst_case_is_worst_for_fingers_in_between():
 # Command line -----------------------------------------------------------------------------------
 
 
+@needs_slycot
 def test_from_specifications_to_a_certified_file(tmp_path):
     # As a program of its own, like a user starts it: within ten seconds on an idle machine.
     out = tmp_path / "controller.yaml"
@@ -279,6 +287,7 @@ def test_what_fails_is_only_written_by_force_and_says_so(tmp_path, command_line,
     assert not build(FeedbackParameters, load(out, "feedback")).certified
 
 
+@needs_slycot
 def test_unusable_input_is_named(tmp_path, command_line, capsys):
     content = yaml.safe_load((PARAMS / "synthesis_fast.yaml").read_text())
     content["/**/synthesize"]["ros__parameters"]["weights"]["effort"]["numerator"] = [0.0, 0.0, 1.0]

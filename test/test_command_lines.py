@@ -20,6 +20,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+pytest.importorskip("numba")  # `commission` and `udp_finger` import it
+
 from piezo_control import start
 from piezo_control.design import cli as design
 from piezo_control.design.problem import SynthesisError

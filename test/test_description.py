@@ -149,10 +149,46 @@ def test_moveit_files_name_joints_and_links_that_exist():
     file = yaml.safe_load((FOLDER / "config" / "moveit_controllers.yaml").read_text())
     manager = file["moveit_simple_controller_manager"]
     (name,) = manager["controller_names"]
+    # What MoveIt's moveit_simple_controller_manager reads of such a controller; of more it takes no notice.
+    assert set(manager[name]) <= {
+        "type", "action_ns", "default", "joints", "command_joint", "max_effort", "max_velocity",
+    }  # fmt: skip
     assert manager[name]["type"] == DEFAULTS.control_action
     assert manager[name]["joints"] == [DEFAULTS.joint]
     assert manager[name]["max_effort"] <= DEFAULTS.force_limit
     assert manager[name]["max_velocity"] <= DEFAULTS.speed_limit
+
+
+def test_moveit_plans_on_the_scale_of_this_gripper():
+    """MoveIt's time parameterization loses pieces of less than 1 µm, `Path::create`; interpolating makes equal ones."""
+    files = {
+        name: yaml.safe_load((FOLDER / "config" / f"{name}.yaml").read_text())
+        for name in ("joint_limits", "ompl_planning", "moveit_controllers")
+    }
+    limits = files["joint_limits"]["joint_limits"][DEFAULTS.joint]
+    lower, upper, velocity = numbers(
+        joint(described(), DEFAULTS.joint).find("limit"), "lower", "upper", "velocity"
+    )
+    # Wider than a measured opening can be off at an end, and no more than the start of a plan may be off.
+    allowed = files["moveit_controllers"]["trajectory_execution"]
+    start = allowed["allowed_start_tolerance"]
+    for margin in (lower - limits["min_position"], limits["max_position"] - upper):
+        assert DEFAULTS.tolerance < margin <= start * (1.0 + 1e-9)
+    controller = files["moveit_controllers"]["moveit_simple_controller_manager"]["gripper"]
+    assert limits["has_velocity_limits"] and limits["has_acceleration_limits"]
+    assert limits["max_velocity"] == controller["max_velocity"] <= velocity
+    planning = files["ompl_planning"]
+    assert 0.0 < planning["totg"]["min_angle_change"] < DEFAULTS.tolerance
+    (group,) = ElementTree.parse(FOLDER / "piezo_gripper.srdf").getroot().findall("group")
+    fraction = planning[group.get("name")]["longest_valid_segment_fraction"]
+    longest = fraction * (limits["max_position"] - limits["min_position"])
+    shortest_of_several = longest / 2
+    assert shortest_of_several > 1e-6
+    way = upper - lower
+    scaling = files["joint_limits"]["default_velocity_scaling_factor"]
+    planned = way / (scaling * limits["max_velocity"])
+    patience = planned * allowed["allowed_execution_duration_scaling"]
+    assert patience + allowed["allowed_goal_duration_margin"] > 2 * way / controller["max_velocity"]
 
 
 def test_controllers_have_tolerances_of_this_gripper():

@@ -7,11 +7,17 @@ import signal
 import subprocess
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 TIMEOUT = 300.0  # s, for all lines of a page on a busy machine
 STAYS = ("cantilever ", "feedforward ", "feedback ", "finger ", "recorder ")  # until it is stopped
 # Tested where they have what they need, a gripper or minutes: test_gripper_stack, test_package.
 ELSEWHERE = ("make ", "fingerctl grip ")
+
+pytestmark = pytest.mark.skipif(
+    not (ROOT / "install" / "sources").exists(), reason="the pages are typed after `make env`"
+)
 
 
 def typed(page, section=""):

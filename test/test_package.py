@@ -12,7 +12,10 @@ from pathlib import Path
 
 import pytest
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
+from packaging.requirements import Requirement
 from rclpy.serialization import deserialize_message, serialize_message
+
+from piezo_control import start
 
 ROOT = Path(__file__).resolve().parents[1]
 MANIFEST = ElementTree.parse(ROOT / "package.xml").getroot()
@@ -62,10 +65,9 @@ JAZZY_PACKAGES = {
     "xacro",
 }
 # ... and keys of rosdep/python.yaml that resolve on Ubuntu noble. There is no key for mcap, none for
-# numba that noble has a package for, and those for control and slycot do not begin with python3.
+# numba that noble has a package for, and that for control does not begin with python3.
 ROSDEP_KEYS = {
     "python-control-pip",
-    "python-slycot-pip",
     "python3-hypothesis",
     "python3-jinja2",
     "python3-matplotlib",
@@ -79,6 +81,7 @@ ROSDEP_KEYS = {
     "python3-scipy",
     "python3-yaml",
 }
+JAZZY_PINS = (ROOT / "requirements" / "jazzy.txt").read_text()
 
 
 def setup_keywords() -> dict[str, ast.expr]:
@@ -108,6 +111,17 @@ def test_dependencies_have_rosdep_keys(manifest):
     assert dependencies - JAZZY_PACKAGES - ROSDEP_KEYS - {"piezo_gripper_msgs"} == set()
 
 
+def test_what_rosdep_installs_by_pip_runs_with_the_numpy_of_jazzy():
+    keys = {e.text for e in MANIFEST if e.tag.endswith("_depend") and e.text.endswith("-pip")}
+    numpy = re.search(r"^numpy==(\S+)", JAZZY_PINS, re.MULTILINE)[1]
+    assert keys
+    for key in keys:
+        package = re.fullmatch(r"python3?-(.+)-pip", key)[1]
+        for requirement in map(Requirement, importlib.metadata.requires(package) or []):
+            if requirement.name == "numpy":
+                assert numpy in requirement.specifier, (package, requirement)
+
+
 def test_imported_ros_packages_are_declared():
     sources = [
         p.read_text() for d in ("piezo_control", "piezo_sim") for p in (ROOT / d).rglob("*.py")
@@ -128,6 +142,74 @@ def test_executables_are_installed():
     installed = {path.name for path in folder.iterdir() if os.access(path, os.X_OK)}
     assert declared >= EXECUTABLES
     assert installed == declared
+
+
+def test_every_executable_begins_where_a_missing_package_is_told():
+    for script in importlib.metadata.entry_points(group="console_scripts"):
+        if script.dist.name == "piezo_gripper":
+            assert script.load().__qualname__ == start.executable("").__qualname__, script
+
+
+def test_every_imported_package_is_declared_or_of_ros():
+    sources = [p for d in ("piezo_control", "piezo_sim") for p in (ROOT / d).rglob("*.py")]
+    imported = {
+        name.split(".")[0]
+        for path in sources
+        for node in ast.walk(ast.parse(path.read_text()))
+        for name in (
+            [alias.name for alias in node.names] if isinstance(node, ast.Import)
+            else [node.module] if isinstance(node, ast.ImportFrom)
+            else []
+        )
+    } - sys.stdlib_module_names - {"piezo_control", "piezo_sim"}  # fmt: skip
+    assert {"bokeh", "llvmlite", "numba", "rclpy", "slycot", "yaml"} <= imported
+    for name in imported:
+        of_ros = name in JAZZY_PACKAGES | {"piezo_gripper_msgs"}
+        assert ("source the setup.bash" in start.how_to_get(name)) == of_ros, name
+
+
+@pytest.mark.parametrize(
+    "executable, absent, said",
+    [
+        ("servo", "numba", "needs numba: pip install numba"),
+        ("servo", "llvmlite", "needs numba: pip install numba"),
+        ("commission", "numba", "needs numba: pip install numba"),
+        ("udp_finger", "numba", "needs numba: pip install numba"),
+        ("panel", "tornado", "needs bokeh: pip install bokeh"),
+        ("cantilever", "rosgraph_msgs", "needs rosgraph_msgs: source the setup.bash of ROS 2"),
+        ("fingerctl", "rclpy", "needs rclpy: source the setup.bash of ROS 2"),
+    ],
+)
+def test_a_missing_package_is_named_with_how_to_get_it(executable, absent, said):
+    done = without(absent, executable, "--help")
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"{executable}: {said}")
+    assert done.stderr.count("\n") == 1
+
+
+def test_firmware_is_exported_without_a_compiler_of_python(tmp_path):
+    done = without("numba", "export", "--out", str(tmp_path / "firmware"))
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "firmware" / "finger.c").exists()
+
+
+def without(absent, executable, *arguments):
+    """Run an executable where a package is not installed."""
+    (script,) = importlib.metadata.entry_points(group="console_scripts", name=executable)
+    blocked = f"""
+import importlib.abc, sys
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, *_):
+        if name.split(".")[0] == {absent!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+sys.argv[0] = {executable!r}
+from {script.module} import {script.attr}
+sys.exit({script.attr}())
+"""
+    return subprocess.run(
+        [sys.executable, "-c", blocked, *arguments], capture_output=True, text=True, timeout=300
+    )
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import http.client
 import math
 import os
 import re
-import shutil
 import signal
 import subprocess
 import time
@@ -17,6 +16,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from ament_index_python.packages import get_package_prefix
+
+pytest.importorskip("bokeh")
+
 from bokeh.events import ButtonClick
 from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.ioloop import IOLoop
@@ -36,11 +38,6 @@ from piezo_gripper_msgs.msg import FingerState, Sample
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 180.0  # s, generous: the tests wait on conditions
-CHROMIUM = shutil.which("chromium")
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync",
-)  # fmt: skip
 
 
 # --- without a browser --------------------------------------------------------------------------------
@@ -273,17 +270,6 @@ def test_a_page_that_is_closed_after_it_was_given_up_is_no_error(caplog, monkeyp
 
 
 # --- in a browser -------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser():
-    if CHROMIUM is None:
-        pytest.skip("no chromium on this machine (apt install chromium)")
-    playwright = pytest.importorskip("playwright.sync_api", reason="installed where chromium is")
-    with playwright.sync_playwright() as p:
-        chromium = p.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
-        yield chromium
-        chromium.close()
 
 
 class Page:

@@ -25,6 +25,8 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
+pytest.importorskip("numba")
+
 from piezo_control.design.cli import read_problem
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters

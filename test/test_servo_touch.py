@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import yaml
 from rich.console import Console
+
+pytest.importorskip("numba")
+
 from test_servo import EXECUTABLES, PATIENT, TIMEOUT, wait
 
 from piezo_control.dynamics import DynamicsParameters

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_panel import browser
 
 from piezo_control.design import cli as design
 from piezo_control.design.certificate import certify
@@ -21,7 +20,6 @@ from piezo_control.report import pictures
 from piezo_control.report.page import Section, write_html
 from piezo_sim.experiment.cases import params_folder
 
-__all__ = ["browser"]  # a fixture of the module above
 needs_bokeh = pytest.mark.skipif(not pictures.HAS_BOKEH, reason="Bokeh is not installed")
 
 

@@ -126,7 +126,8 @@ def slicot() -> ModuleType:
         import slycot.exceptions
     except ImportError:
         raise SynthesisError(
-            "method 'hinf' needs slycot (GPL-2.0): pip install slycot, or use a method without weights"
+            "method 'hinf' needs slycot (GPL-2.0): pip install --no-deps slycot, "
+            "or use a method without weights"
         ) from None
     return slycot
 

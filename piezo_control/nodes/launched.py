@@ -7,10 +7,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from launch import LaunchContext
+from launch.actions import DeclareLaunchArgument
 from launch_ros.actions import Node
 
 from piezo_control.parameters import is_for, need_one_for
 
+RESPAWN_DELAY = 1.0  # s
 SWITCH = ["true", "false", "True", "False"]
 ARGUMENTS = {
     "namespace": ("finger", "namespace of the finger's nodes and topics"),
@@ -21,6 +23,21 @@ ARGUMENTS = {
     "log_level": ("info", "of every node"),
 }
 """Arguments of each launch file that starts nodes, with their defaults."""
+
+
+def declared(
+    arguments: Mapping[str, tuple[str, str]], **choices: list[str]
+) -> list[DeclareLaunchArgument]:
+    """Return the declarations of `arguments`, by default and description; some have `choices`, as switches have."""
+    return [
+        DeclareLaunchArgument(
+            name,
+            default_value=default,
+            description=text,
+            choices=SWITCH if default in SWITCH else choices.get(name),
+        )
+        for name, (default, text) in arguments.items()
+    ]
 
 
 def is_on(given: Mapping[str, str], name: str) -> bool:
@@ -62,7 +79,7 @@ def launched(
             parameters=sources(name),
             ros_arguments=["--log-level", given["log_level"]],
             respawn=is_on(given, "respawn"),
-            respawn_delay=1.0,
+            respawn_delay=RESPAWN_DELAY,
             output="screen",
         )
         for name in parameters

@@ -22,17 +22,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-try:
-    from bokeh.application import Application
-    from bokeh.application.handlers import FunctionHandler
-    from bokeh.server.connection import ServerConnection
-    from bokeh.server.server import BaseServer
-    from bokeh.server.tornado import BokehTornado
-    from tornado.httpserver import HTTPServer
-    from tornado.ioloop import IOLoop, PeriodicCallback
-    from tornado.netutil import bind_sockets
-except ModuleNotFoundError as error:
-    sys.exit(f"panel: {error}: pip install bokeh")
+from bokeh.application import Application
+from bokeh.application.handlers import FunctionHandler
+from bokeh.server.connection import ServerConnection
+from bokeh.server.server import BaseServer
+from bokeh.server.tornado import BokehTornado
+from tornado.httpserver import HTTPServer
+from tornado.ioloop import IOLoop, PeriodicCallback
+from tornado.netutil import bind_sockets
 
 from piezo_control.nodes.client import (
     ClientError,

@@ -13,12 +13,9 @@ import math
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
 
 from piezo_control.parameters import ParameterError
 from piezo_control.safety import LARGEST_VOLTAGE, is_physical
@@ -53,15 +50,6 @@ class Driver(Protocol):
         """Let go of the device; called again, do nothing."""
 
 
-class Card(NamedTuple):
-    """Addresses of a driver's functions and of its open device; `reading` is where a sample goes."""
-
-    read: int
-    write: int
-    device: int
-    reading: np.ndarray  # deflection in the card's unit, age (s)
-
-
 class SharedLibrary:
     """A device behind a shared library.
 
@@ -70,6 +58,9 @@ class SharedLibrary:
     """
 
     def __init__(self, driver: str, options: str, sample_time: float) -> None:
+        # Only who opens a device calls it in a compiled loop; who exports the law does without numba.
+        from piezo_control.servo.card import Card, read_card, write_card
+
         path = library(driver)
         try:
             self._functions = ctypes.CDLL(str(path))
@@ -156,37 +147,3 @@ def library(driver: str) -> Path:
             "or the path of a shared library"
         )
     return path.resolve()
-
-
-@intrinsic
-def _call_read(_: Any, function: Any, device: Any, reading: Any) -> Any:
-    """Call ``int read(device, reading)`` at the address `function`."""
-    return types.int32(types.intp, types.intp, types.intp), _caller(("word", "word"))
-
-
-@intrinsic
-def _call_write(_: Any, function: Any, device: Any, voltage: Any) -> Any:
-    """Call ``int write(device, voltage)`` at the address `function`."""
-    return types.int32(types.intp, types.intp, types.float64), _caller(("word", "double"))
-
-
-def _caller(arguments: tuple[str, ...]) -> Any:
-    """Return code that calls the C function whose address comes first, with such arguments."""
-
-    def generate(_: Any, builder: Any, __: Any, values: Any) -> Any:
-        kinds = {"word": ir.IntType(64), "double": ir.DoubleType()}
-        signature = ir.FunctionType(ir.IntType(32), [kinds[name] for name in arguments])
-        address = builder.inttoptr(values[0], signature.as_pointer())
-        return builder.call(address, values[1:])
-
-    return generate
-
-
-def read_card(card: Card, _: int) -> int:
-    """Take a sample into ``card.reading``; return FRESH, NONE_IN_TIME or FAILED."""
-    return _call_read(card.read, card.device, card.reading.ctypes.data)
-
-
-def write_card(card: Card, voltage: float, _: int) -> int:
-    """Put out `voltage` (in the card's unit); return FRESH or FAILED."""
-    return _call_write(card.write, card.device, voltage)

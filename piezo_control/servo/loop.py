@@ -25,10 +25,10 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile, Signal
 from piezo_control.safety import FAULT, NORMAL, RAMPING
+from piezo_control.servo.card import read_card as read
+from piezo_control.servo.card import write_card as write
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
 from piezo_control.servo.driver import FRESH, Driver, applied
-from piezo_control.servo.driver import read_card as read
-from piezo_control.servo.driver import write_card as write
 from piezo_control.servo.law import (
     CAUSES,
     DEVICE,

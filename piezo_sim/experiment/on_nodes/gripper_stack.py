@@ -3,7 +3,8 @@
 
 What the nodes say comes out here. Ctrl-C ends all of them, with the fingers at rest; so does the end of any one.
 A recorder waits until it is told to record, as by `fingerctl record on`. The fingers hold a force, without a force
-sensor; with --controller they hold a position instead, and feel nothing.
+sensor; with --controller they hold a position instead, and feel nothing. It is no node itself: in place of
+`--ros-args -r __ns:=/NAME` it takes --namespace NAME, and --params in place of `--params-file`.
 
 Exit code: 0 ended by a signal, 1 a node ended by itself, 2 unusable arguments.
 """
