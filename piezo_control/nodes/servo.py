@@ -56,6 +56,7 @@ from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import FingerState, Sample, SampleBlock
 
 TARGET_TIME = 0.1  # s that the error stays small before a finger is on target
+STEADY = 0.2  # s that a phase lasts before the log says it
 PHASE_OF = {
     NORMAL: FingerState.RUNNING,
     HOLDING: FingerState.HOLDING,
@@ -88,6 +89,7 @@ class ServoNode(FingerNode):
         )
         self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
         self.phase = FingerState.IDLE
+        self._entered = time.monotonic()
         self._last: Samples | None = None
         self._voltage, self._left = 0.0, ""  # of the loop before: V, and why that is not at rest
         self._held = 0  # samples whose command was at an end of its range
@@ -375,13 +377,17 @@ class ServoNode(FingerNode):
         phase = FingerState.HOLDING if stuck else PHASE_OF[s.phase]
         if phase == FingerState.RAMPING and not s.cause:
             phase = FingerState.WAITING  # until the card, which was elsewhere, is at rest
+        now = time.monotonic()
         if phase == self.phase:
+            # A busy machine holds now and then for a few samples, which `state` counts and the log need not say.
+            if phase not in LATCHED_PHASES and now - self._entered > STEADY:
+                self.say(PHASES[phase])
             return
-        before, self.phase = self.phase, phase
+        before, self.phase, self._entered = self.phase, phase, now
         if phase == FingerState.RUNNING:
             self._since = math.nan
         elif math.isnan(self._since):
-            self._since = time.monotonic()
+            self._since = now
         if stuck:
             self.get_logger().error(stuck)
             self.publish_diagnostics()
@@ -390,8 +396,6 @@ class ServoNode(FingerNode):
                 f"{s.cause}; voltage goes to rest and stays there; {self.way_on()}"
             )
             self.publish_diagnostics()
-        elif phase != FingerState.FAULT:
-            self.say(PHASES[phase])
         self._publish_state()
 
     def _publish_state(self) -> None:
