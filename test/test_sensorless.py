@@ -2,6 +2,7 @@
 """The sensorless law on fingers that are its model, and what it does when inputs are missing or limited."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -160,6 +161,25 @@ def test_the_truth_plant_is_held_within_2_percent_by_models_identified_from_reco
         assert np.max(np.abs(found[name][1])) <= 2.0, name
     (alone,) = errors(truth, "hysteresis", "hold_22_to_32degc").values()
     assert np.max(np.abs(alone[1])) > 15.0
+
+
+@pytest.mark.parametrize("degc", [22.0, 32.0])
+@pytest.mark.parametrize("damping", [0.5, 2.0])
+@pytest.mark.parametrize("resonance", [0.9, 0.95, 1.0, 1.05, 1.1])
+def test_a_truth_plant_that_is_not_the_identified_one_vibrates_by_5_percent_at_most(
+    truth, resonance, damping, degc
+):
+    _, models = truth
+    plant = CantileverParameters(plant="truth")
+    a2, a1, _ = plant.dynamics.denominator
+    moved = (a2 / resonance**2, a1 * damping / resonance, 1.0)
+    plant = replace(plant, dynamics=replace(plant.dynamics, denominator=moved))
+    run = engine.run_sensorless(
+        plant, models, TemperatureParameters(base_degc=degc), STEP, round(0.11 / H)
+    )
+    after = run.true_deflection[round(0.102 / H) :]
+    assert np.ptp(after) / 2.0 <= 0.05 * 20e-6
+    assert np.max(np.abs(after - 20e-6)) <= 0.05 * 20e-6
 
 
 SINES = [f"{hertz}hz_{degc}degc" for hertz in (1, 10, 50) for degc in (22, 32)]

@@ -59,7 +59,7 @@ def test_taps_sum_to_1_and_none_is_negative(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_profile_that_is_known_ahead_is_reached_at_the_end_of_its_sample(kind):
-    """Exactly on straight lines; around a bend the shaper's own miss m is left as m - a * m."""
+    """Exactly on straight lines; around a bend is left what the shaper misses of its miss, twice but for two taps."""
     taps = np.array(shaper(ShapingParameters(kind=kind), DENOMINATOR, H))
     bend = Profile([0.0, 0.02, 0.04], [0.0, 0.0, 1.0], linear=True)
     plan = ahead(bend, 0.0, 0.04, taps, H)
@@ -67,20 +67,19 @@ def test_a_profile_that_is_known_ahead_is_reached_at_the_end_of_its_sample(kind)
     reached = np.array([shape(taps, past, plan.at(k * H), 1.0) for k in range(400)])
     end = H * np.arange(1, 401)
     span = len(taps) * H
-    far = (np.abs(end - 0.02) > 2.0 * span) & (end < 0.04 - 2.0 * span) & (end > span)
+    far = (np.abs(end - 0.02) > 3.0 * span) & (end < 0.04 - 3.0 * span) & (end > span)
     np.testing.assert_allclose(reached[far], bend.at(end)[far], rtol=0, atol=1e-12)
 
-    def shaped(time):
-        return sum(tap * bend.at(time - j * H) for j, tap in enumerate(taps))
+    def missed(of):
+        late = delay(taps, H) - H * np.arange(len(taps))
+        return lambda time: of(time) - sum(tap * of(time + t) for tap, t in zip(taps, late))
 
-    def missed(time):
-        return bend.at(time) - shaped(time + delay(taps, H))
-
-    late = delay(taps, H)
-    left = missed(end) - sum(tap * missed(end + late - j * H) for j, tap in enumerate(taps))
+    twice = missed(missed(bend.at))
+    left = (twice if kind == "zero_vibration" else missed(twice))(end)
     near = ~far & (end < 0.03)
     np.testing.assert_allclose(bend.at(end)[near], (reached + left)[near], rtol=0, atol=1e-12)
-    assert np.max(np.abs(left[near])) < np.max(np.abs(missed(end)[near]))
+    for course in (twice, missed(bend.at)):
+        assert np.max(np.abs(left[near])) <= np.max(np.abs(course(end)[near]))
 
 
 @pytest.mark.parametrize("kind", ["zero_vibration", "robust"])
@@ -119,7 +118,7 @@ def test_no_count_below_the_fewest_suffices(hertz, sample_time, count):
     """The counts that linear programs at 2, 3, 4, ... taps find, one after the other."""
     omega = 2.0 * np.pi * hertz
     mode = (1.0 / omega**2, 2.0 * 0.02 / omega, 1.0)
-    assert len(shaper(ShapingParameters(), mode, sample_time)) == count
+    assert len(shaper(ShapingParameters(residual=0.05), mode, sample_time)) == count
 
 
 @pytest.mark.parametrize("hertz", [50.0, 20.0])
