@@ -18,8 +18,9 @@ resonance and sample time.
 No tap is negative: a shaped step rises without turning back, so that it leaves no minor loop behind in the
 hysteresis (with taps of either sign it could be a fifth shorter, on a finger without hysteresis).
 
-A profile that is known ahead is sent by the shaper's delay d too early, and with what the shaper rounds off on top (one
-or two steps of van Cittert's iteration; h for the held sample): with t' = t + d + h and m(t) = r(t) - sum_j a_j r(t + d - j h)
+A profile that is known ahead is sent by the shaper's delay d too early, and with what the shaper rounds off on
+top (one or two steps of van Cittert's iteration; h for the held sample): with t' = t + d + h and
+m(t) = r(t) - sum_j a_j r(t + d - j h)
 
     r'(t) = r(t') + m(t') + (m(t') - sum_j a_j m(t' + d - j h)).
 
@@ -27,8 +28,8 @@ It is a reference as any other, so no vibration comes with it; the tip misses th
 by (1 - A) r. A shaper of two taps does better with one step.
 
 Sources: N. Singer, W. Seering, ASME J. Dynamic Systems, Measurement, and Control 112 (1990) 76 (zero
-vibration, robust); P. H. van Cittert, Z. Phys. 69 (1931) 298 (iteration); W. Singhose et al., IEEE ICRA (1995) 3112 (bounded residual); M. Rakotondrabe, C. Clévy,
-P. Lutz, IEEE T-ASE 7 (2010) 440 (on piezocantilevers).
+vibration, robust); W. Singhose et al., IEEE ICRA (1995) 3112 (bounded residual); P. H. van Cittert, Z. Phys. 69
+(1931) 298 (iteration); M. Rakotondrabe, C. Clévy, P. Lutz, IEEE T-ASE 7 (2010) 440 (on piezocantilevers).
 """
 
 from __future__ import annotations

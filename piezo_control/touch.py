@@ -154,12 +154,20 @@ def touch_coefficients(
 
 def touch_rest() -> TouchState:
     """Return the state of a finger that touches nothing, at command 0."""
-    pairs = ([0.0, 0.0] for _ in range(3))
-    ones = ([0.0] for _ in range(7))
     return TouchState(
-        next(pairs), next(pairs), next(ones), next(ones), next(ones), next(ones), [0.0] * LOOPS,
-        [0.0] * LOOPS, next(ones), next(pairs), next(ones), next(ones),
-    )  # fmt: skip
+        missing=[0.0, 0.0],
+        behind=[0.0, 0.0],
+        share=[0.0],
+        drift=[0.0],
+        way=[0.0],
+        heading=[0.0],
+        turns=[0.0] * LOOPS,
+        shares=[0.0] * LOOPS,
+        depth=[0.0],
+        mean=[0.0, 0.0],
+        reference=[0.0],
+        command=[0.0],
+    )
 
 
 # Step functions: plain scalars and indexables, so that numba can compile them as they are.
