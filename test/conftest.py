@@ -13,6 +13,7 @@ FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 )  # fmt: skip
+LOG_TAIL = 4000  # characters of a node's log
 
 own_domain.take()
 
@@ -30,6 +31,17 @@ def pytest_configure(config):
         "markers",
         "shows(row, ...): rows of the table of faults in docs/safety.md that a test shows",
     )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    """Show beside a test that failed what its nodes said."""
+    report = yield
+    if report.failed and "tmp_path" in item.funcargs:
+        for log in sorted(item.funcargs["tmp_path"].rglob("*.log")):
+            words = log.read_text(errors="replace")[-LOG_TAIL:]
+            report.sections.append((f"end of {log.name}", words))
+    return report
 
 
 @pytest.fixture(scope="module")

@@ -105,8 +105,7 @@ def test_a_lockstep_feedforward_ramps_too(neighbour, tmp_path, end):
         command = neighbour.publisher("command")
         neighbour.insist(command, sample(0, 5e-6), lambda: voltages)
         for number in range(1, 10):
-            command.publish(sample(number, 18e-6))
-            neighbour.wait(lambda n=number: voltages[-1].number == n)
+            neighbour.ask_sample(command, sample(number, 18e-6), voltages)
         assert voltages[-1].value > 30.0
         if end == "deactivation":
             assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
@@ -309,8 +308,7 @@ def test_a_reference_that_no_finger_reaches_is_refused(neighbour, tmp_path, nons
         )
         neighbour.tell("feedback", reference, sample(0, 1e-6))
         for number in range(1, 40):
-            deflection.publish(sample(number, 0.0))
-            neighbour.wait(lambda n=number: commands[-1].number == n)
+            neighbour.ask_sample(deflection, sample(number, 0.0), commands)
     assert all(math.isfinite(c.value) for c in commands)
     assert 0.0 < commands[-1].value < 22e-6
 
@@ -369,8 +367,7 @@ def test_a_reset_of_a_feedback_that_runs_changes_nothing(neighbour, tmp_path):
         neighbour.tell("feedback", reference, sample(0, 20e-6))
         neighbour.insist(deflection, sample(0, 0.0), lambda: commands)
         for number in range(1, 40):
-            deflection.publish(sample(number, 1e-6))
-            neighbour.wait(lambda n=number: commands[-1].number == n)
+            neighbour.ask_sample(deflection, sample(number, 1e-6), commands)
             if number == 20:
                 assert reset(neighbour, "feedback").success
     steps = np.abs(np.diff([c.value for c in commands[1:]]))

@@ -75,15 +75,16 @@ class Neighbour:
         while not done():
             assert time.monotonic() < end, "nothing came"
 
-    def insist(self, publisher, message, done):
+    def insist(self, publisher, message, done, period=0.05):
         """Publish again and again until `done()`, as what is sent before the endpoints match is lost."""
-        timer = self.node.create_timer(0.05, lambda: publisher.publish(message))
+        timer = self.node.create_timer(period, lambda: publisher.publish(message))
         self.wait(done)
         self.node.destroy_timer(timer)
 
-    def send(self, publisher, message, done):
+    def ask_sample(self, publisher, message, answers):
+        """Send a sample and wait for its answer; asked again where none comes, as the plant does."""
         publisher.publish(message)
-        self.wait(done)
+        self.insist(publisher, message, lambda: answers[-1].number == message.number, period=5.0)
 
     def listen(self, kind, topic, qos=SAMPLE):
         heard = []
@@ -291,8 +292,7 @@ def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp
         neighbour.tell("feedback", reference, sample(0, 10e-6))
         neighbour.insist(deflection, sample(0, 9e-6), lambda: commands)
         for number in range(1, 50):
-            deflection.publish(sample(number, 9e-6))
-            neighbour.wait(lambda n=number: commands[-1].number == n)
+            neighbour.ask_sample(deflection, sample(number, 9e-6), commands)
         before = commands[-1].value
         gain = neighbour.get("feedback", "command_high") * 0.5
         assert neighbour.set("feedback", command_high=gain).successful
@@ -358,8 +358,7 @@ def test_feedforward_answers_with_the_law(neighbour, tmp_path):
         command = neighbour.publisher("command")
         neighbour.insist(command, sample(0, commands[0]), lambda: voltages)
         for number, value in enumerate(commands[1:], 1):
-            command.publish(sample(number, value))
-            neighbour.wait(lambda n=number: voltages[-1].number == n)
+            neighbour.ask_sample(command, sample(number, value), voltages)
     got = [v for v in voltages if v.number > 0]
     assert [v.number for v in got] == [1, 2, 3, 4]
     assert [voltages[0].value, *(v.value for v in got)] == [law.step(value) for value in commands]

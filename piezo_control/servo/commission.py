@@ -53,7 +53,7 @@ from piezo_control.parameters import ParameterError, build, dump, flatten  # noq
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
 from piezo_control.servo.driver import Driver, DriverError, applied, open_driver  # noqa: E402
-from piezo_control.servo.law import NO_CAUSE, SENSOR_OLD  # noqa: E402
+from piezo_control.servo.law import SENSOR_OLD  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
 from piezo_control.servo.parameters import ServoParameters  # noqa: E402
 from piezo_control.shared import shared_folder  # noqa: E402
@@ -145,9 +145,8 @@ class Bench:
         taken = []
 
         def go_on() -> Samples:
-            if servo.cause_code != NO_CAUSE or servo.stuck:
-                kind = LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer
-                raise kind(servo.cause or servo.stuck)
+            if wrong := servo.cause or servo.stuck:
+                raise (LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer)(wrong)
             time.sleep(0.02)
             servo.look_ahead()
             return servo.samples()

@@ -283,6 +283,7 @@ class Servo:
         self._force_limit = float(self._loop.laws.feeling.max_force[0])
         self._run = loop_with(driver)
         self._taken = 0
+        self._seen_at = (-1, 0.0)  # the edge that the loop was last found at, and since when
         self.lost = 0
         # The end of the program, whatever ends it, ends the loop with the voltage at rest.
         self._thread = threading.Thread(target=self._work, name="servo", daemon=True)
@@ -310,9 +311,17 @@ class Servo:
 
     @property
     def stuck(self) -> str:
-        """Say that the loop does not go on, because its driver does not come back; empty: it does."""
+        """Say that the loop does not go on, because its driver does not come back; empty: it does.
+
+        The time counts from the first look at this that found the loop where it is. A machine that stops the whole
+        process stops who looks, too, and is not taken for a driver that does not come back.
+        """
         span = self.parameters.hold_time + WAIT
-        silence = time.monotonic() - 1e-9 * self._loop.clock.edge[0]
+        now = time.monotonic()
+        edge = int(self._loop.clock.edge[0])
+        if edge != self._seen_at[0]:
+            self._seen_at = edge, now
+        silence = now - self._seen_at[1]
         if not self.is_running or self.number < 0 or silence <= span + self.sample_time:
             return ""
         return (
