@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of all shipped controllers: its linear figures are the certificates', its runs the finger's."""
 
+import itertools
 import re
 
 import pytest
@@ -46,6 +47,7 @@ def test_the_papers_controller_is_not_stable_on_every_finger_of_the_box(linear):
 
 def test_one_column_of_the_table_step_and_sines_cold_and_warm(monkeypatch, tmp_path):
     monkeypatch.setattr(baselines, "CONTROLLERS", ("robust",))
+    monkeypatch.setattr(baselines, "PREVIEWED", ("robust, preview",))
     with Progress(disable=True) as progress:
         section = baselines.study(tmp_path, {"prandtl_ishlinskii": None}, progress)
     assert section.columns == ["figure", "robust", "robust, preview"]
@@ -59,3 +61,25 @@ def test_one_column_of_the_table_step_and_sines_cold_and_warm(monkeypatch, tmp_p
     assert min(plain) > 90.0 and ahead[0] <= 5.0
     settling, _ = rows["prandtl_ishlinskii: settling [ms]"]
     assert max(settling) <= 6.0  # what 'robust' is certified for
+
+
+def test_what_follows_a_model_runs_with_the_temperature_undone(monkeypatch, tmp_path):
+    """The figures that are asked of the two, nominally 2.5 ms with the smaller box, at 32 °C too; preview 1, 5, 2 %."""
+    monkeypatch.setattr(baselines, "CONTROLLERS", ("robust", "following", "following_adapted"))
+    monkeypatch.setattr(baselines, "PREVIEWED", ("following, preview",))
+    monkeypatch.setattr(baselines, "HERTZ", (10.0, 100.0))
+    with Progress(disable=True) as progress:
+        section = baselines.study(tmp_path, {"prandtl_ishlinskii": None}, progress)
+    rows = {
+        row[0]: [list(map(float, cell.split(" / "))) for cell in row[2:]] for row in section.rows
+        if row[0].startswith("prandtl")
+    }  # fmt: skip
+    settling, overshoot, tenth, hundredth = (
+        rows[f"prandtl_ishlinskii: {label}"]
+        for label in (
+            "settling [ms]", "overshoot [%]", "10 Hz, largest error [%]", "100 Hz, largest error [%]",
+        )
+    )  # fmt: skip
+    assert max(settling[0]) <= 4.0 and max(settling[1]) <= 2.5
+    assert max(itertools.chain(*overshoot)) <= 0.5
+    assert max(tenth[-1]) <= 1.0 and max(hundredth[-1]) <= 5.0
