@@ -256,20 +256,29 @@ class RecorderNode(FingerNode):
     def _write_series(self, topic: str, series: SampleSeries) -> None:
         """Write the samples of a series as if they had come one by one."""
         track = self.tracks.get(topic)
-        first = nanoseconds(series)
-        for i, (later, value, flags) in enumerate(zip(series.later, series.value, series.flags)):
+        first, period = nanoseconds(series), series.period
+        number = series.number - 1
+        for later, value, flags in zip(series.later, series.value, series.flags):
             if self.writer is None or track is None:
                 return
-            number, stamp = series.number + i, first + later
-            if self._is_new(track, number, stamp):
-                data = sample_data(
-                    stamp, number, value, series.period,
-                    bool(flags & SampleSeries.LIMITED),
-                    bool(flags & SampleSeries.BY_CONTROLLER),
-                    bool(flags & SampleSeries.WITHOUT_TEMPERATURE),
-                )  # fmt: skip
-                self._tell_time(max(stamp + track.begin, self.newest, 1))
-                self._put(track, stamp + track.begin, data)
+            number += 1
+            stamp = first + later
+            if track.run == self.run and number == track.sequence.next > 1:
+                track.sequence.count(
+                    number
+                )  # as nearly all are: no more looks than needed, the loop waits for these
+            elif not self._is_new(track, number, stamp):
+                continue
+            data = sample_data(
+                stamp, number, value, period,
+                flags & SampleSeries.LIMITED != 0,
+                flags & SampleSeries.BY_CONTROLLER != 0,
+                flags & SampleSeries.WITHOUT_TEMPERATURE != 0,
+            )  # fmt: skip
+            stamp += track.begin
+            if stamp >= self.newest or self.unstamped:
+                self._tell_time(max(stamp, self.newest, 1))
+            self._put(track, stamp, data)
 
     def _put(self, track: Track, stamp: int, data: bytes) -> None:
         """Write a message at `stamp` (ns in the bag)."""

@@ -2,7 +2,7 @@
 """A topic of numbered samples: each at once for the loop, and all of them in series for who takes them down.
 
 A message costs more than what the loop computes for it. A recorder that read every sample by itself would take the
-time that two fingers on two cores have for their loops; a series of a hundred costs it little more than one.
+time that two fingers on two cores have for their loops; a series of hundreds costs it little more than one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import SAMPLE
 from piezo_gripper_msgs.msg import Sample, SampleSeries
 
-LONGEST = 100  # samples of a series
+LONGEST = 250  # samples of a series
 LATEST = 0.05  # s until a sample that waits for others is sent
 
 
