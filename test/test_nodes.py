@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from ament_index_python.packages import get_package_prefix
@@ -555,12 +556,12 @@ def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbou
             series.later = [i * 100_000 for i in range(len(first))]
             series.flags = [0] * len(first)
             recorded += len(first)
-            send = neighbour.insist if first == range(1) else neighbour.send
-            send(
-                publishers[name],
-                series,
-                lambda n=recorded: states and sum(states[-1].recorded) == n,
-            )
+            is_there = lambda n=recorded: states and sum(states[-1].recorded) == n  # noqa: E731
+            if first == range(1):
+                neighbour.insist(publishers[name], series, is_there)
+            else:
+                publishers[name].publish(series)
+                neighbour.wait(is_there)
         recorder.running["recorder"].terminate()
         assert recorder.running["recorder"].wait(TIMEOUT) == 0
     for run, count, values in ((0, 10, (1.0, 2.0)), (1, 4, (3.0, 4.0))):
@@ -569,6 +570,65 @@ def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbou
         assert (got.deflection.tolist(), got.command.tolist()) == (
             [values[0]] * count, [values[1]] * count,
         )  # fmt: skip
+
+
+def test_a_finger_that_runs_free_and_counts_anew_is_recorded_on(neighbour, tmp_path):
+    """Activated again, it begins with the first sample whose time has passed, which is never sample 0."""
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        deflection, command = (neighbour.publisher(name) for name in ("deflection", "command"))
+        begin, recorded = int(time.time()), 0
+        for first, last in ((1, 50), (3, 20)):
+            for publisher, offset in ((command, 2), (deflection, 0)):  # in either order
+                for number in range(first + offset, last):
+                    message = sample(number, 1e-6 * first)
+                    message.header.stamp.sec = begin + first
+                    message.header.stamp.nanosec = number * 1_000_000
+                    if first == 1 and number == first + offset:
+                        neighbour.insist(
+                            publisher, message,
+                            lambda n=recorded: states and sum(states[-1].recorded) > n,
+                        )  # fmt: skip
+                    else:
+                        publisher.publish(message)
+                    recorded += 1
+                neighbour.wait(lambda n=recorded: sum(states[-1].recorded) == n)
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    for run, first, last in ((0, 1, 50), (1, 3, 20)):
+        got = read(bag, run=run)
+        assert got.number.tolist() == list(range(first, last))
+        assert np.isfinite(got.command).sum() == last - first - 2
+
+
+def test_single_samples_that_overtake_their_series_lose_none_of_it(neighbour, tmp_path):
+    """A foreign publisher of the topic lets the recorder hear single samples while a series is on its way."""
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        series = neighbour.node.create_publisher(SampleSeries, "deflection_series", SAMPLE)
+        single, _ = (
+            neighbour.node.create_publisher(Sample, "deflection", SAMPLE) for _ in range(2)
+        )
+
+        def sent(first, last):
+            message = SampleSeries(number=first, period=1e-4, value=[1e-6] * (last - first))
+            message.header.stamp.nanosec = first * 100_000
+            message.later = [i * 100_000 for i in range(last - first)]
+            message.flags = [0] * (last - first)
+            return message
+
+        neighbour.insist(series, sent(0, 1), lambda: states and sum(states[-1].recorded) == 1)
+        later = sample(25, 1e-6)
+        later.header.stamp.nanosec = 25 * 100_000
+        neighbour.insist(single, later, lambda: sum(states[-1].recorded) == 2)
+        series.publish(sent(1, 40))
+        neighbour.wait(lambda: sum(states[-1].recorded) == 40)
+        assert sum(states[-1].missing) == 0
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    assert read(bag).number.tolist() == list(range(40))
 
 
 def test_signals_that_come_while_a_node_ends_change_nothing(neighbour, tmp_path):
