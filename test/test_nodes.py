@@ -285,6 +285,25 @@ def test_a_finger_that_would_swing_itself_up_is_not_answered(neighbour, tmp_path
         neighbour.wait(lambda: any("force control swings up on a finger" in f.text for f in faults))
 
 
+def test_a_certificate_that_leaves_out_the_temperature_asks_who_undoes_it(neighbour, tmp_path):
+    def said():
+        of_feedback = [s for message in heard for s in message.status if s.name == "/feedback"]
+        return [v.value for s in of_feedback for v in s.values if v.key == "not covered"]
+
+    with (
+        node("feedback", tmp_path, "feedback_following.yaml"),
+        node("feedforward", tmp_path, temperature_lockstep=True),
+    ):
+        heard = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
+        neighbour.wait(lambda: said() and said()[-1])
+        assert "'compensator: sensorless' of 'feedforward' does" in said()[-1]
+        assert (tmp_path / "feedback.log").read_text().count(said()[-1]) == 1
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
+        assert neighbour.set("feedforward", compensator="sensorless").successful
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_ACTIVATE)
+        neighbour.wait(lambda: said()[-1] == "")
+
+
 def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp_path):
     with node("feedback", tmp_path, "feedback_paper.yaml"):
         commands = neighbour.listen(Sample, "command")
