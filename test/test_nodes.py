@@ -22,6 +22,7 @@ from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
@@ -46,6 +47,7 @@ from piezo_gripper_msgs.msg import (
 )
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
+from piezo_sim.nodes.cantilever import CantileverNode
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 60.0  # s, generous: the tests wait on conditions
@@ -430,6 +432,21 @@ def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
     stamps = [d.header.stamp.sec + d.header.stamp.nanosec * 1e-9 for d in deflections]
     assert stamps == sorted(stamps)
     assert 0.0 < states[-1].jitter  # how much is the machine's affair; `make bench` measures it
+
+
+def test_a_cantilever_that_runs_free_measures_no_sample_twice(neighbour):
+    """Its timer comes twice within a sample time where it was late before."""
+    node = CantileverNode()
+    node.set_parameters([Parameter("mode", value="free_running")])
+    heard = neighbour.listen(Sample, "deflection")
+    neighbour.wait(lambda: node.deflections.readers())
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    while node.number < 100:
+        node._tick()
+    neighbour.wait(lambda: heard and heard[-1].number == node.number)
+    node.trigger_shutdown()
+    node.destroy_node()
+    assert np.all(np.diff([sample.number for sample in heard]) > 0)
 
 
 def test_parameters_are_described_and_refused_with_their_range(neighbour, tmp_path):
