@@ -44,6 +44,11 @@ class FeedbackParameters:
     certified: bool = parameter(
         False, "true when `synthesize` recomputed the closed loop and every specification was met"
     )
+    temperature_undone: bool = parameter(
+        False,
+        "true when the gains it was designed for leave out what the temperature does to the stroke: the "
+        "feedforward undoes that, `compensator: sensorless`",
+    )
     sample_time: float = parameter(
         1e-4, "sample time the coefficients were designed for", unit="s", low=1e-6, high=1.0
     )
@@ -168,11 +173,18 @@ def successor(name: str, present: FeedbackParameters) -> FeedbackParameters:
     )
 
 
+TEMPERATURE_REMAINS = (
+    "its gains leave out what the temperature does to the stroke, and this feedforward does not undo that; "
+    "'compensator: sensorless' of 'feedforward' does"
+)
+
+
 def uncovered(
     parameters: FeedbackParameters,
     delay_samples: int,
     denominator: Sequence[float],
     reach: tuple[float, float],
+    undoes_temperature: bool,
 ) -> list[str]:
     """Return what the controller's certificate does not cover on a finger, in words; empty: nothing.
 
@@ -180,6 +192,8 @@ def uncovered(
     ----------
     delay_samples, denominator, reach
         Delay from voltage to reading, D(s), and the deflections (m) that the finger reaches.
+    undoes_temperature
+        Whether the feedforward under the controller follows the temperature.
     """
     p = parameters
     if p.controller == "none":
@@ -204,6 +218,8 @@ def uncovered(
             f"its commands of {p.command_low * 1e6:g} to {p.command_high * 1e6:g} µm leave the finger's reach of "
             f"{reach[0] * 1e6:.4g} to {reach[1] * 1e6:.4g} µm"
         )
+    if p.temperature_undone and not undoes_temperature:
+        found.append(TEMPERATURE_REMAINS)
     return found
 
 

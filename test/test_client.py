@@ -5,6 +5,7 @@ import io
 import os
 import signal
 import subprocess
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from piezo_control.recording.recording import WAVEFORM_TYPE, read
 from piezo_control.waveform import Waveform
 from piezo_gripper_msgs.msg import FingerState, Profile, Sample
 from piezo_gripper_msgs.msg import Waveform as WaveformMessage
+from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 180.0  # s, generous: the tests wait on conditions
@@ -258,6 +260,22 @@ def test_stopped_finger_is_at_rest_and_starts_again(finger):
         finger.set(2e-6)
     finger.start()
     finger.wait_for(lambda: finger.words() == "running" and near(finger, 5e-6)())
+
+
+def test_a_finger_that_runs_free_is_stopped_and_starts_again_without_a_fault(ros, tmp_path):
+    """Stopped one by one, its blocks would miss each other for longer than their hold time."""
+    words = ["-r", "__ns:=/free", "-p", "mode:=free_running", "-p", "sample_time:=0.01"]
+    with NodeProcesses({"finger": ["--ros-args", *words]}, tmp_path):
+        finger = ros.finger("free")
+        finger.wait_for(lambda: finger.words() == "running")
+        finger.stop()
+        finger.wait_for(lambda: finger.words() == "idle" and finger.state.voltage == 0.0)
+        begin = time.monotonic()
+        ros.wait(lambda: time.monotonic() > begin + 0.3, lambda: "")  # three hold times
+        finger.start()
+        finger.wait_for(lambda: finger.words() == "running")
+        finger.set(3e-6)
+        finger.wait_for(lambda: finger.state.voltage > 1.0)
 
 
 def test_fault_is_in_words_and_reset_ends_it(ros, finger, control, capsys):

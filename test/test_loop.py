@@ -17,12 +17,14 @@ from rich.progress import Progress
 from rosbags.highlevel import AnyReader
 
 from piezo_control.nodes.client import connect
+from piezo_control.parameters import ParameterError
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import read
 from piezo_sim.experiment import cli
 from piezo_sim.experiment.cases import NODES, Case
 from piezo_sim.experiment.on_engine import run_on_engine
 from piezo_sim.experiment.on_nodes import grasp, servo
+from piezo_sim.experiment.on_nodes.conductor import alone
 from piezo_sim.experiment.on_nodes.processes import NodeDied, NodeProcesses
 from piezo_sim.experiment.on_nodes.runner import run_cases
 
@@ -215,3 +217,28 @@ def test_nodes_that_run_are_left_alone(main, words, namespace, tmp_path, monkeyp
         with connect(30.0) as ros:
             ros.wait(lambda: ros.nodes() == before, lambda: f"{ros.nodes()}, not {before}")
     assert [path.name for path in tmp_path.iterdir()] == ["log"]
+
+
+def test_two_experiments_that_start_together_do_not_share_a_finger():
+    """Neither has nodes that the other could see; one that is killed is in nobody's way."""
+    hold = (
+        "from piezo_sim.experiment.on_nodes.conductor import alone\n"
+        "with alone('/finger'): print('here', flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        try:
+            assert first.stdout.readline() == b"here\n"
+            refused = (
+                r"another experiment runs in /finger of ROS domain \d+; .* another --namespace"
+            )
+            with pytest.raises(ParameterError, match=refused):
+                with alone("/finger", instead="--namespace"):
+                    pass
+            with alone("/other"):
+                pass
+        finally:
+            first.kill()
+    with alone("/finger"):
+        pass

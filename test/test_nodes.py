@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from ament_index_python.packages import get_package_prefix
@@ -21,6 +22,7 @@ from lifecycle_msgs.srv import ChangeState
 from mcap.reader import make_reader
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParametersAtomically
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Temperature
@@ -45,6 +47,7 @@ from piezo_gripper_msgs.msg import (
 )
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
+from piezo_sim.nodes.cantilever import CantileverNode
 
 EXECUTABLES = Path(get_package_prefix("piezo_gripper")) / "lib" / "piezo_gripper"
 TIMEOUT = 60.0  # s, generous: the tests wait on conditions
@@ -284,6 +287,25 @@ def test_a_finger_that_would_swing_itself_up_is_not_answered(neighbour, tmp_path
         neighbour.wait(lambda: any("force control swings up on a finger" in f.text for f in faults))
 
 
+def test_a_certificate_that_leaves_out_the_temperature_asks_who_undoes_it(neighbour, tmp_path):
+    def said():
+        of_feedback = [s for message in heard for s in message.status if s.name == "/feedback"]
+        return [v.value for s in of_feedback for v in s.values if v.key == "not covered"]
+
+    with (
+        node("feedback", tmp_path, "feedback_following.yaml"),
+        node("feedforward", tmp_path, temperature_lockstep=True),
+    ):
+        heard = neighbour.listen(DiagnosticArray, "/diagnostics", 10)
+        neighbour.wait(lambda: said() and said()[-1])
+        assert "'compensator: sensorless' of 'feedforward' does" in said()[-1]
+        assert (tmp_path / "feedback.log").read_text().count(said()[-1]) == 1
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_DEACTIVATE)
+        assert neighbour.set("feedforward", compensator="sensorless").successful
+        assert neighbour.change_state("feedforward", Transition.TRANSITION_ACTIVATE)
+        neighbour.wait(lambda: said()[-1] == "")
+
+
 def test_feedback_hands_over_to_another_controller_without_a_bump(neighbour, tmp_path):
     with node("feedback", tmp_path, "feedback_paper.yaml"):
         commands = neighbour.listen(Sample, "command")
@@ -410,6 +432,21 @@ def test_cantilever_running_free_holds_then_ramps_to_0_v(neighbour, tmp_path):
     stamps = [d.header.stamp.sec + d.header.stamp.nanosec * 1e-9 for d in deflections]
     assert stamps == sorted(stamps)
     assert 0.0 < states[-1].jitter  # how much is the machine's affair; `make bench` measures it
+
+
+def test_a_cantilever_that_runs_free_measures_no_sample_twice(neighbour):
+    """Its timer comes twice within a sample time where it was late before."""
+    node = CantileverNode()
+    node.set_parameters([Parameter("mode", value="free_running")])
+    heard = neighbour.listen(Sample, "deflection")
+    neighbour.wait(lambda: node.deflections.readers())
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    while node.number < 100:
+        node._tick()
+    neighbour.wait(lambda: heard and heard[-1].number == node.number)
+    node.trigger_shutdown()
+    node.destroy_node()
+    assert np.all(np.diff([sample.number for sample in heard]) > 0)
 
 
 def test_parameters_are_described_and_refused_with_their_range(neighbour, tmp_path):
@@ -555,12 +592,12 @@ def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbou
             series.later = [i * 100_000 for i in range(len(first))]
             series.flags = [0] * len(first)
             recorded += len(first)
-            send = neighbour.insist if first == range(1) else neighbour.send
-            send(
-                publishers[name],
-                series,
-                lambda n=recorded: states and sum(states[-1].recorded) == n,
-            )
+            is_there = lambda n=recorded: states and sum(states[-1].recorded) == n  # noqa: E731
+            if first == range(1):
+                neighbour.insist(publishers[name], series, is_there)
+            else:
+                publishers[name].publish(series)
+                neighbour.wait(is_there)
         recorder.running["recorder"].terminate()
         assert recorder.running["recorder"].wait(TIMEOUT) == 0
     for run, count, values in ((0, 10, (1.0, 2.0)), (1, 4, (3.0, 4.0))):
@@ -569,6 +606,65 @@ def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbou
         assert (got.deflection.tolist(), got.command.tolist()) == (
             [values[0]] * count, [values[1]] * count,
         )  # fmt: skip
+
+
+def test_a_finger_that_runs_free_and_counts_anew_is_recorded_on(neighbour, tmp_path):
+    """Activated again, it begins with the first sample whose time has passed, which is never sample 0."""
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        deflection, command = (neighbour.publisher(name) for name in ("deflection", "command"))
+        begin, recorded = int(time.time()), 0
+        for first, last in ((1, 50), (3, 20)):
+            for publisher, offset in ((command, 2), (deflection, 0)):  # in either order
+                for number in range(first + offset, last):
+                    message = sample(number, 1e-6 * first)
+                    message.header.stamp.sec = begin + first
+                    message.header.stamp.nanosec = number * 1_000_000
+                    if first == 1 and number == first + offset:
+                        neighbour.insist(
+                            publisher, message,
+                            lambda n=recorded: states and sum(states[-1].recorded) > n,
+                        )  # fmt: skip
+                    else:
+                        publisher.publish(message)
+                    recorded += 1
+                neighbour.wait(lambda n=recorded: sum(states[-1].recorded) == n)
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    for run, first, last in ((0, 1, 50), (1, 3, 20)):
+        got = read(bag, run=run)
+        assert got.number.tolist() == list(range(first, last))
+        assert np.isfinite(got.command).sum() == last - first - 2
+
+
+def test_single_samples_that_overtake_their_series_lose_none_of_it(neighbour, tmp_path):
+    """A foreign publisher of the topic lets the recorder hear single samples while a series is on its way."""
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        series = neighbour.node.create_publisher(SampleSeries, "deflection_series", SAMPLE)
+        single, _ = (
+            neighbour.node.create_publisher(Sample, "deflection", SAMPLE) for _ in range(2)
+        )
+
+        def sent(first, last):
+            message = SampleSeries(number=first, period=1e-4, value=[1e-6] * (last - first))
+            message.header.stamp.nanosec = first * 100_000
+            message.later = [i * 100_000 for i in range(last - first)]
+            message.flags = [0] * (last - first)
+            return message
+
+        neighbour.insist(series, sent(0, 1), lambda: states and sum(states[-1].recorded) == 1)
+        later = sample(25, 1e-6)
+        later.header.stamp.nanosec = 25 * 100_000
+        neighbour.insist(single, later, lambda: sum(states[-1].recorded) == 2)
+        series.publish(sent(1, 40))
+        neighbour.wait(lambda: sum(states[-1].recorded) == 40)
+        assert sum(states[-1].missing) == 0
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    assert read(bag).number.tolist() == list(range(40))
 
 
 def test_signals_that_come_while_a_node_ends_change_nothing(neighbour, tmp_path):

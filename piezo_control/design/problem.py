@@ -74,6 +74,11 @@ class Uncertainty:
     damping_high: float = parameter(2.0, "largest factor on the damping ratio", low=1.0, high=100.0)
     gain_low: float = parameter(0.9, "smallest factor on the loop gain", low=0.01, high=1.0)
     gain_high: float = parameter(1.1, "largest factor on the loop gain", low=1.0, high=100.0)
+    temperature_undone: bool = parameter(
+        False,
+        "the range of the gain leaves out what the temperature does to the stroke: the feedforward undoes "
+        "that, `compensator: sensorless`",
+    )
     unmodelled_share: float = parameter(
         0.0,
         "static share, of either sign, of a mode that nobody modelled; the loop has to stay stable",

@@ -100,6 +100,7 @@ def run_time_controller(system: StateSpace, problem: DesignProblem) -> FeedbackP
         name=problem.name,
         delay_samples=problem.finger.delay_samples,
         denominator=problem.finger.denominator,
+        temperature_undone=problem.uncertainty.temperature_undone,
         sample_time=problem.finger.sample_time,
         command_low=problem.finger.command_low,
         command_high=problem.finger.command_high,

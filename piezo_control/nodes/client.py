@@ -86,8 +86,8 @@ FOLLOWERS = ("feedback", "servo")
 """Nodes that follow a reference."""
 LIMITERS = ("servo", "feedforward")
 """Nodes that keep the voltage within its limits."""
-STOPPERS = ("servo", "cantilever", "feedforward")
-"""Nodes that bring the voltage to rest when they are deactivated; the first that is there does."""
+STOPPERS = ("feedforward", "cantilever", "servo")
+"""Nodes that bring the voltage to rest when they are deactivated, in an order in which none misses another."""
 TRANSITIONS = {
     "configure": Transition.TRANSITION_CONFIGURE,
     "activate": Transition.TRANSITION_ACTIVATE,
@@ -737,23 +737,40 @@ class Finger:
 
     def stop(self) -> None:
         """Bring the voltage to rest, where it stays until `start`; a finger that is stopped stays so."""
-        node = self.node(*STOPPERS)
+        refused = [words for node in self._stoppers() if (words := self._bring_to_rest(node))]
+        if refused:
+            raise ClientError("; ".join(refused))
+
+    def _bring_to_rest(self, node: str) -> str:
+        """Deactivate a node and return why it is not inactive then; empty: it is."""
         try:
             self.ros.lifecycle(node, "deactivate")
-        except ClientError:
-            if self.ros.lifecycle(node) != "inactive":
-                raise
+        except ClientError as error:
+            with suppress(ClientError):
+                if self.ros.lifecycle(node) == "inactive":
+                    return ""
+            return str(error)
+        return ""
 
     def start(self) -> None:
         """Let a stopped finger run again; its reference is that of before."""
-        self.ros.lifecycle(self.node(*STOPPERS), "activate")
+        nodes = self._stoppers()
+        stopped = [node for node in nodes if self.ros.lifecycle(node) != "active"]
+        for node in stopped or nodes:  # one that runs refuses
+            self.ros.lifecycle(node, "activate")
+
+    def _stoppers(self) -> list[str]:
+        """Return the full names of those of `STOPPERS` that are there; ClientError: none is."""
+        self.node(*STOPPERS)
+        there = self.nodes()
+        return [self.prefix + name for name in STOPPERS if self.prefix + name in there]
 
     def reset(self) -> dict[str, str]:
         """Leave latched faults; return what each node says. ClientError if one of them cannot.
 
         The finger itself comes last, since its first sample has to be answered by all the others.
         """
-        nodes = sorted(self.nodes(), key=lambda name: name.endswith(STOPPERS[:2]))
+        nodes = sorted(self.nodes(), key=lambda name: name.endswith(STOPPERS[1:]))
         if not nodes:
             raise ClientError(f"'{self.namespace}' is {self.words()}")
         answers = {n: self.ros.call(Trigger, f"{n}/reset", Trigger.Request()) for n in nodes}
@@ -771,9 +788,11 @@ class Finger:
         """
         recorder = self.node("recorder")
         if self.ros.lifecycle(recorder) == "active":
-            raise ClientError(
-                f"'{recorder}' is recording already; `fingerctl record off` ends that"
-            )
+            if self._is_recording():
+                raise ClientError(
+                    f"'{recorder}' is recording already; `fingerctl record off` ends that"
+                )
+            self.ros.lifecycle(recorder, "deactivate")
         self.ros.set_parameters(recorder, {"bag": bag})
         if self.ros.lifecycle(recorder) == "unconfigured":
             self.ros.lifecycle(recorder, "configure")
@@ -786,8 +805,16 @@ class Finger:
         recorder = self.node("recorder")
         if self.ros.lifecycle(recorder) != "active":
             raise ClientError(f"'{recorder}' is not recording")
+        is_whole = self._is_recording()
         self.ros.lifecycle(recorder, "deactivate")
         self.ros.lifecycle(recorder, "cleanup")
+        if not is_whole:
+            raise ClientError(f"'{recorder}' had to end its recording before; its log says why")
+
+    def _is_recording(self) -> bool:
+        """Say whether the active recorder has a bag: it gives up one that the disk does not take."""
+        state = self._recorder()
+        return state is None or bool(state.bag)
 
     def _on_followed(self, read: Callable[[Any], Signal], message: Any) -> None:
         try:

@@ -3,7 +3,8 @@
 
 in:  deflection (Sample, m), reference (Sample, m: a set-point), reference_profile (Profile, m),
      reference_waveform (Waveform, m), expected (Sample, m) with `force_control`: the deflection of a tip that
-     nobody pushes, dynamics (Dynamics) with that: how the tip gives way, by the feedforward's file
+     nobody pushes, dynamics (Dynamics): how the tip gives way, by the feedforward's file, and whether
+     it undoes what the temperature does, for which some certificates ask
 out: command (Sample, m), reference_followed_profile (Profile, m), reference_followed_waveform (Waveform, m),
      push (Sample, N) with `force_control`: the force of an object, as estimated
 
@@ -33,6 +34,7 @@ from piezo_control.design.preview import asked
 from piezo_control.design.touching import check_stable
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import (
+    TEMPERATURE_REMAINS,
     Feedback,
     FeedbackParameters,
     controller_file,
@@ -72,6 +74,7 @@ class FeedbackNode(BlockNode):
         self._expectations: Subscription | None = None
         self.touch: Touch | None = None  # before the tip's dynamics are known
         self.dynamics: DynamicsParameters | None = None
+        self._undoes_temperature = True  # the feedforward, as long as none says that it does not
         self.create_subscription(Dynamics, "dynamics", self._on_dynamics, LATCHED)
         self._file = ""
         self._loading = False
@@ -161,6 +164,13 @@ class FeedbackNode(BlockNode):
             "elastic_constant": told.elastic_constant,
         }
         self.dynamics = None
+        before = self._objection()
+        self._undoes_temperature = bool(told.denominator)
+        if self.active and self._objection() != before:
+            self._warn()
+        if not self._undoes_temperature:
+            self.touch = None
+            return
         try:
             self.dynamics = build(DynamicsParameters, values, self.resolve_topic_name("dynamics"))
             self._feel_on()
@@ -198,13 +208,21 @@ class FeedbackNode(BlockNode):
         self._warn()
 
     def _warn(self) -> None:
-        """Say that a controller that is to run has no certificate."""
+        """Say that a controller that is to run has no certificate, or what that does not cover."""
         p = self.parameters
         if p.controller != "none" and not (p.certified or p.force_control):
             self.get_logger().warning(
                 f"controller '{p.name}' ({p.controller_file or 'from parameters'}) is not certified: nothing "
                 "says that the loop is stable with this finger"
             )
+        if objection := self._objection():
+            self.get_logger().warning(f"controller '{p.name}': {objection}")
+
+    def _objection(self) -> str:
+        """Return what the certificate does not cover with the feedforward that is there; empty: nothing."""
+        p = self.parameters
+        is_undone = self._undoes_temperature or p.force_control or not p.temperature_undone
+        return "" if is_undone else TEMPERATURE_REMAINS
 
     def stop(self) -> None:
         if self._expectations and self._pushes:
@@ -260,6 +278,7 @@ class FeedbackNode(BlockNode):
         wrong, figures = super().report()
         p = self.parameters
         figures |= {"controller": p.name, "certified": p.certified, **command_range(p)}
+        figures |= {"not covered": self._objection()}
         if p.force_control:
             push = self.touch.push if self.touch else math.nan
             figures |= {"controller": "force control", "certified": False, "push": push}

@@ -6,7 +6,7 @@ in:  command (Sample, m), state (FingerState: the voltage that is applied when t
      deflection (Sample, m) with that and `adaptation.time_constant`
 out: voltage (Sample, V), clipped and limited in slew: the last place before the actuator;
      expected (Sample, m) with `compensator: sensorless`: the deflection that the models expect a sample later,
-     dynamics (Dynamics) with that: what a feedback that feels has to know of the tip
+     dynamics (Dynamics), of the tip, for a feedback that feels; without that compensator an empty one
 
 Running free, a command that stays away is held and then ramped to rest, `rest_voltage`, where
 it stays until `~/reset`. When the node is deactivated, shut down or stopped by a signal, the voltage ramps to
@@ -86,17 +86,18 @@ class FeedforwardNode(BlockNode):
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures.clear()
+        told = Dynamics()
         if self.parameters.compensator == "sensorless":
             self._temperature_input = TemperatureInput(self, self._on_temperature)
             self._deflection = Sample(value=math.nan)
             tip = self.parameters.dynamics
             told = Dynamics(denominator=tip.denominator, elastic_constant=tip.elastic_constant)
-            told.header.stamp = base.system_time()
-            self.dynamics.publish(told)
             if self.parameters.adaptation.time_constant:
                 self._deflection_input = self.create_subscription(
                     Sample, "deflection", self._on_deflection, SAMPLE
                 )
+        told.header.stamp = base.system_time()
+        self.dynamics.publish(told)
         if self.parameters.mode == "free_running":
             self.watchdog.reset()
 

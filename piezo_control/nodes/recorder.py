@@ -78,6 +78,7 @@ class Track:
         self.is_block = connection.msgtype == BLOCK_TYPE
         self.is_stamped = connection.msgtype == TEMPERATURE_TYPE
         self.sequence = Sequence(gaps=True)
+        self.gap = range(0)  # numbers that were passed over last: their series may still come
         self.run = 0
         self.begin = 0  # ns in the bag, of that run
         self.last_stamp = -1
@@ -306,33 +307,44 @@ class RecorderNode(FingerNode):
                 throttle_duration_sec=1.0,
             )
             return False
+        if number in track.gap and kind == STRAY:
+            track.gap = track.gap[track.gap.index(number) + 1 :]
+            track.missing -= not self.has_blocks
+            return True
         if kind in (REPEATED, STRAY):
             track.duplicates += 1
             return False
         if not self.has_blocks:  # beside blocks, single samples are a selection
             track.missing += number - max(track.sequence.next, 0)
+        if 0 <= track.sequence.next < number:
+            track.gap = range(track.sequence.next, number)
         track.sequence.count(number)
+        track.last_stamp = stamp
         return True
 
     def _follow_run(self, track: Track, number: int, stamp: int) -> None:
         """Begin a new run with a sample 0, and with the numbers that go back of the topics that are behind.
 
-        The end of the run before may still be on its way, with numbers that go on.
+        The end of the run before may still be on its way, with numbers that go on. A finger that runs free has no
+        sample 0 when it is activated again; its numbers go back while its stamps go on.
         """
+        goes_back = number < track.sequence.next - 1 and stamp > track.last_stamp
         if track.run == self.run:
-            if (
-                number > 0 or track.sequence.next <= 1
-            ):  # no sample 0, or the one that has come already
+            # Sample 0 may be the one that has come already.
+            if not goes_back and (number > 0 or track.sequence.next <= 1):
                 return
             # In simulated time the new run begins at 0 again; in the bag it comes after the one before.
             self.begin = self.newest + PAUSE if stamp <= self.newest else 0
             self.run += 1
             self.leader = track
             for other in self.tracks.values():
-                other.last_stamp = -1
-        elif 0 <= track.sequence.next <= number or number >= self.leader.sequence.next:
+                if other.is_stamped:
+                    other.last_stamp = -1
+        elif not goes_back and (
+            0 <= track.sequence.next <= number or number >= self.leader.sequence.next
+        ):
             return
-        track.sequence = Sequence(gaps=True)
+        track.sequence, track.gap = Sequence(gaps=True), range(0)
         track.run, track.begin = self.run, self.begin
 
     def report(self) -> tuple[str, dict[str, Any]]:

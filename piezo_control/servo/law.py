@@ -308,7 +308,8 @@ def objections(
 ) -> list[str]:
     """Return what speaks against running the controller on the finger with this D(s), in words; empty: nothing."""
     reach = Feedforward(feedforward, feedback.sample_time).reachable_range
-    return uncovered(feedback, feedback.delay_samples, denominator, reach)
+    sensorless = False  # under a controller the servo undoes the hysteresis only
+    return uncovered(feedback, feedback.delay_samples, denominator, reach, sensorless)
 
 
 def watch_at_rest() -> Watch:

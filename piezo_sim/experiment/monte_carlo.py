@@ -223,8 +223,13 @@ def main(arguments: list[str] | None = None) -> int:
             **widths,
         )
         reach = Feedforward(study.feedforward, study.plant.sample_time).reachable_range
+        steady = True  # the temperature: what the gain may be is said by the box
         for words in uncovered(
-            feedback, study.plant.sensor.delay_samples, study.plant.dynamics.denominator, reach
+            feedback,
+            study.plant.sensor.delay_samples,
+            study.plant.dynamics.denominator,
+            reach,
+            steady,
         ):
             print(f"monte_carlo: controller '{given.controller}': {words}", file=sys.stderr)
         result = monte_carlo(

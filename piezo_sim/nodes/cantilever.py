@@ -345,6 +345,8 @@ class CantileverNode(FingerNode):
         due = int((now - self.begun) / p.sample_time) + 1
         if p.samples:
             due = min(due, p.samples)
+        if due == self.number:
+            return  # the tick before this one was late: no sample's time has passed since
         rest = self._limits()
         for number in range(self.number, due):
             demand = self.plant.voltage if self.pending_voltage is None else self.pending_voltage

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import socket
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from lifecycle_msgs.msg import State, Transition
@@ -30,21 +33,36 @@ SERVICE_RETRY = 1.0  # s
 DISCOVERY = 1.0  # s, in which the nodes that run become known
 
 
-def need_free(*namespaces: str, instead: str = "ROS_DOMAIN_ID") -> None:
-    """Raise ParameterError, naming them, where others run: two would drive one finger.
+@contextmanager
+def alone(*namespaces: str, instead: str = "ROS_DOMAIN_ID") -> Iterator[None]:
+    """Keep `namespaces` for one experiment; raise ParameterError, naming them, where others run: two would drive one finger.
 
-    `instead` is what the user may name another one of.
+    An experiment whose nodes have just started is not seen yet, so each holds a socket that has a name and no file:
+    it is known wherever topics of this machine are, and ends with its process, whatever ends that. `instead` is what
+    the user may name another one of.
     """
-    with connect() as ros:
-        ros.closing.wait(DISCOVERY)
-        running = [node.rpartition("/") for node in ros.nodes()]
-    for namespace in namespaces:
-        names = [name for where, _, name in running if where == namespace]
-        if names:
-            raise ParameterError(
-                f"{namespace or '/'} has nodes already: {', '.join(names)}; "
-                f"end them, or name another {instead}"
-            )
+    with ExitStack() as held:
+        with connect() as ros:
+            domain = ros.node.context.get_domain_id()
+            for namespace in namespaces:
+                name = hashlib.sha256(f"piezo_gripper {domain} {namespace}".encode()).hexdigest()
+                try:
+                    held.enter_context(socket.socket(socket.AF_UNIX)).bind(f"\0{name}")
+                except OSError:
+                    raise ParameterError(
+                        f"another experiment runs in {namespace or '/'} of ROS domain {domain}; "
+                        f"wait for its end, or name another {instead}"
+                    ) from None
+            ros.closing.wait(DISCOVERY)
+            running = [node.rpartition("/") for node in ros.nodes()]
+        for namespace in namespaces:
+            names = [name for where, _, name in running if where == namespace]
+            if names:
+                raise ParameterError(
+                    f"{namespace or '/'} has nodes already: {', '.join(names)}; "
+                    f"end them, or name another {instead}"
+                )
+        yield
 
 
 class Conductor:

@@ -29,7 +29,7 @@ from piezo_control.report.page import Section
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
-from piezo_sim.experiment.on_nodes.conductor import need_free
+from piezo_sim.experiment.on_nodes.conductor import alone
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 from piezo_sim.experiment.plots import save
 from piezo_sim.plant.cantilever import CantileverParameters
@@ -218,15 +218,15 @@ def work(
     arguments: argparse.Namespace, out: Path, console: Console
 ) -> tuple[dict[str, Any], list[Section]]:
     """Pick, hold, carry and place in every way that is asked for, and draw what came of it."""
-    need_free("", *(f"/{side}" for side in SIDES))
     runs = {}
-    for name in arguments.ways:
-        with console.status(f"{WAYS[name].title}: {CARRIED_UNTIL:g} s of two fingers"):
-            try:
-                bags = run(WAYS[name], out / name)
-            except ClientError as error:
-                raise RunFailed(str(error)) from None
-            runs[name] = [recorded(bag) for bag in bags.values()]
+    with alone("", *(f"/{side}" for side in SIDES)):
+        for name in arguments.ways:
+            with console.status(f"{WAYS[name].title}: {CARRIED_UNTIL:g} s of two fingers"):
+                try:
+                    bags = run(WAYS[name], out / name)
+                except ClientError as error:
+                    raise RunFailed(str(error)) from None
+                runs[name] = [recorded(bag) for bag in bags.values()]
     found = {name: figures(grasps) for name, grasps in runs.items()}
     picture = draw(runs, out / "grasp.png")
     rows = [

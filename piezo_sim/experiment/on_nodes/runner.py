@@ -15,7 +15,7 @@ from piezo_control.nodes import spin
 from piezo_control.start import stop_at_signals
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment.cases import NODES, Case, CaseRun, RunFailed, params_folder
-from piezo_sim.experiment.on_nodes.conductor import Conductor, need_free
+from piezo_sim.experiment.on_nodes.conductor import Conductor, alone
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
 STALL = 30.0  # s without a new sample after which a run is given up
@@ -38,32 +38,34 @@ def run_cases(
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     discovery = params_folder() / "discovery.xml"
     os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(discovery))
-    need_free(f"/{namespace}", instead="--namespace")
-    spin.init()
-    stop = stop_at_signals()
-    commands = {
-        name: ["--ros-args", "-r", f"__ns:=/{namespace}", "-p", "autostart:=false"]
-        for name in NODES
-    }
-    try:
-        with NodeProcesses(commands, out / "log") as processes:
+    with alone(f"/{namespace}", instead="--namespace"):
+        spin.init()
+        stop = stop_at_signals()
+        commands = {
+            name: ["--ros-args", "-r", f"__ns:=/{namespace}", "-p", "autostart:=false"]
+            for name in NODES
+        }
+        try:
+            with NodeProcesses(commands, out / "log") as processes:
 
-            def check() -> None:
-                if stop.is_set():
-                    raise Interrupted("interrupted: nodes stopped, the last bag may be incomplete")
-                processes.check()
+                def check() -> None:
+                    if stop.is_set():
+                        raise Interrupted(
+                            "interrupted: nodes stopped, the last bag may be incomplete"
+                        )
+                    processes.check()
 
-            conductor = Conductor(NODES, namespace, check)
-            try:
-                conductor.wait_for_nodes()
-                for case in cases:
-                    yield run_case(
-                        case, conductor, out / "bags" / case.name, len(processes), progress
-                    )
-            finally:
-                conductor.close()
-    finally:
-        rclpy.try_shutdown()
+                conductor = Conductor(NODES, namespace, check)
+                try:
+                    conductor.wait_for_nodes()
+                    for case in cases:
+                        yield run_case(
+                            case, conductor, out / "bags" / case.name, len(processes), progress
+                        )
+                finally:
+                    conductor.close()
+        finally:
+            rclpy.try_shutdown()
 
 
 def run_case(

@@ -30,7 +30,7 @@ from piezo_control.report.page import Section
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
-from piezo_sim.experiment.on_nodes.conductor import Conductor, need_free
+from piezo_sim.experiment.on_nodes.conductor import Conductor, alone
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 from piezo_sim.experiment.plots import save
 
@@ -155,8 +155,8 @@ def work(
     arguments: argparse.Namespace, out: Path, console: Console
 ) -> tuple[dict[str, Any], list[Section]]:
     """Run the step and draw what came of it."""
-    need_free("")
-    with console.status("a step of 20 µm at 10 kHz; at first the loops are compiled"):
+    words = "a step of 20 µm at 10 kHz; at first the loops are compiled"
+    with alone(""), console.status(words):
         bag, seen = run(out)
     found, recording, late = figures(bag, seen)
     picture = draw(recording, late, out / "servo.png")
