@@ -5,6 +5,8 @@ import io
 import os
 import signal
 import subprocess
+import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -389,3 +391,19 @@ def test_fingerctl_names_the_fingers_that_are_there(ros, capsys):
         in done.stderr
     )
     assert "Traceback" not in done.stderr
+
+
+def test_what_another_thread_destroys_does_not_end_the_connection():
+    """The thread that hears prepares to wait for it at that very moment."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with connect(TIMEOUT) as connection:
+            node = connection.node
+            first, second = (node.create_publisher(Sample, "nobody", SETPOINT) for _ in range(2))
+            for _ in range(1000):
+                node.destroy_publisher(first)
+                first, second = second, node.create_publisher(Sample, "nobody", SETPOINT)
+            assert "client" in [thread.name for thread in threading.enumerate()]
+    finally:
+        sys.setswitchinterval(before)

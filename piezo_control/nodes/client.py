@@ -36,7 +36,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.action import ActionClient
 from rclpy.context import Context
-from rclpy.exceptions import InvalidNamespaceException
+from rclpy.exceptions import InvalidHandle, InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -857,7 +857,9 @@ def connect(timeout: float = 10.0, closing: Stop | None = None) -> Iterator[Ros]
 
     def spin() -> None:
         while not closing.is_set():
-            executor.spin_once(timeout_sec=LONGEST_WAIT)
+            # What another thread destroys while this one prepares to wait is left out of the next wait.
+            with suppress(InvalidHandle):
+                executor.spin_once(timeout_sec=LONGEST_WAIT)
 
     thread = threading.Thread(target=spin, name="client", daemon=True)
     thread.start()

@@ -265,9 +265,9 @@ class RecorderNode(FingerNode):
             number += 1
             stamp = first + later
             if track.run == self.run and number == track.sequence.next > 1:
-                track.sequence.count(
-                    number
-                )  # as nearly all are: no more looks than needed, the loop waits for these
+                # Nearly all do go on, and what is saved here is left to the loop.
+                track.sequence.count(number)
+                track.last_stamp = stamp
             elif not self._is_new(track, number, stamp):
                 continue
             data = sample_data(
