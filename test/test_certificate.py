@@ -23,7 +23,7 @@ from piezo_control.design.certificate import (
     stable_resonances,
     weighted_norms,
 )
-from piezo_control.design.cli import finger_origin, main, read_problem
+from piezo_control.design.cli import finger_origin, main, read_problem, short_times
 from piezo_control.design.problem import DesignProblem, TransferFunction, Uncertainty
 from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters, read_controller
@@ -285,6 +285,19 @@ def test_what_fails_is_only_written_by_force_and_says_so(tmp_path, command_line,
     assert command_line(paper, "--out", str(out), "--force") == 1
     assert "NOT CERTIFIED" in out.read_text().splitlines()[0]
     assert not build(FeedbackParameters, load(out, "feedback")).certified
+
+
+def test_times_that_are_short_for_a_slower_finger_are_said():
+    """`robust` allows the paper's finger 4 and 10 periods of 1.5 ms; one of 300 Hz has periods of 3.3 ms."""
+    problem = build(DesignProblem, load(PARAMS / "synthesis_robust.yaml", "synthesize"))
+    assert short_times(problem) == ""
+    a2 = (2.0 * np.pi * 300.0) ** -2
+    slower = dataclasses.replace(
+        problem, finger=dataclasses.replace(problem.finger, denominator=(a2, 2e-5, 1.0))
+    )
+    said = short_times(slower)
+    assert "settling_time is 0.006 s, 1.8 periods of the resonance of 300 Hz" in said
+    assert "has 4, here 0.0133 s" in said and "has 10, here 0.0333 s" in said
 
 
 @needs_slycot

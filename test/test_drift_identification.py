@@ -117,8 +117,8 @@ def test_creep_and_heat_are_taken_out_of_a_recording(recordings):
 
 
 def test_fit_describes_the_recordings(recordings):
-    for curve in identify_drift(recordings, PLANT.hysteresis).fitted:
-        _, measured, modelled = curve.T
+    for fit in identify_drift(recordings, PLANT.hysteresis).fitted:
+        _, measured, modelled = fit.curve.T
         assert np.sqrt(np.mean((measured - modelled) ** 2)) < 20e-9
 
 

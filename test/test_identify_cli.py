@@ -153,6 +153,28 @@ def test_what_drift_and_dynamics_find_joins_the_feedforward_of_node_and_servo(id
     assert servo.hysteresis == models.hysteresis
 
 
+def test_loops_that_the_operator_describes_badly_tell_of_heat_by_their_difference(
+    identify, tmp_path
+):
+    """They count by what changes from one temperature to the other, and so they are judged."""
+    plant = CantileverParameters(plant="truth", sample_time=1e-2)
+    bags = []
+    for degc in (22.0, 32.0):
+        temperatures = TemperatureParameters(base_degc=degc)
+        for name, voltage, duration in (
+            ("loop", decaying_sine(40.0, cycles=5, frequency_hz=0.5), 10.0),
+            ("creep", Profile([0.0, 1.0], [0.0, 40.0]), 60.0),
+        ):
+            bags.append(tmp_path / f"{name}_{degc:g}")
+            samples = round(duration / plant.sample_time)
+            made = drive(plant, temperatures, voltage, samples)
+            write_recording(bags[-1], "f", made, voltage, ZERO)
+    assert identify("drift", *bags) == 0
+    fits = json.loads((tmp_path / "identified" / "drift.json").read_text())["fits"]
+    assert f"{bags[2]} less {bags[0].name}" in fits
+    assert max(fit["rms_percent"] for fit in fits.values()) < 0.5
+
+
 def test_every_step_ends_in_one_cantilever_file(identify, tmp_path):
     """Hysteresis, D(s) and elastic constant of the default finger, each from a bag of its own."""
     quick = CantileverParameters()

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from weights import FAST, needs_slycot
 
 from piezo_control.design import hinf
-from piezo_control.design.certificate import certify
+from piezo_control.design.certificate import Box, certify
 from piezo_control.design.hinf import (
     delayed_finger,
     generalised_plant,
@@ -48,7 +48,7 @@ from piezo_control.design.state_space import (
     realise,
     to_w_plane,
 )
-from piezo_control.design.structures import shaped_weights
+from piezo_control.design.structures import STRUCTURES, shaped_weights
 from piezo_control.design.synthesis import synthesize
 from piezo_control.feedback import FeedbackParameters
 from piezo_control.parameters import ParameterError, build, load
@@ -105,6 +105,24 @@ def test_smallest_gamma_of_the_fingers_coprime_problem():
     expected = math.sqrt(1.0 + np.linalg.eigvals(x @ z).real.max())
     plant = generalised_plant(StateSpace(a, b, c, d), *(realise(CONSTANT),) * 3)
     assert expected * 0.999 <= smallest_gamma(plant) <= expected * 1.011
+
+
+@pytest.mark.parametrize("hertz, delay", [(300.0, 2), (450.0, 3), (666.6, 1), (1500.0, 1)])
+def test_a_search_for_another_finger_begins_stable(hertz, delay):
+    """One sample of 0.1 ms is 0.15 periods at 1500 Hz, more than two are at 666.6 Hz."""
+    p = problem("robust")
+    omega = 2.0 * math.pi * hertz
+    finger = dataclasses.replace(
+        p.finger, denominator=(omega**-2.0, 0.02 / omega, 1.0), delay_samples=delay
+    )
+    p = dataclasses.replace(p, finger=finger)
+    starts, complete = STRUCTURES[p.method]
+    corners = Box(p, resonance=3, damping=3, gain=3, points=10)
+    radii = [
+        max(part.max() for part in corners.radius(synthesize(complete(p, np.array(x))).controller))
+        for x in starts(p)
+    ]
+    assert min(radii) < 1.0
 
 
 @needs_slycot

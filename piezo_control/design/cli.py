@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import os
 import sys
 import time
@@ -89,12 +90,16 @@ def main() -> int:
     console.print(f"took {time.perf_counter() - begin:.1f} s")
     if not certificate.met:
         hint = "" if arguments.force else f". {out} is only written with --force"
-        print(f"synthesize: {shortfall(certificate)}{hint}", file=sys.stderr)
+        print(f"synthesize: {shortfall(certificate, problem)}{hint}", file=sys.stderr)
     return 0 if certificate.met else 1
 
 
-def shortfall(certificate: Certificate) -> str:
-    """Say how far the worst fingers are from what a certificate requires, and which ones they are."""
+USUAL_PERIODS = {"settling_time": 4.0, "force_settling_time": 10.0}
+"""Of the resonance, that params/synthesis_robust.yaml allows the paper's finger."""
+
+
+def shortfall(certificate: Certificate, problem: DesignProblem) -> str:
+    """Say how far the worst fingers are from what is required, which ones they are, and which times are short."""
 
     def distance(row: Row) -> str:
         unit = f" {row.unit}" if row.unit else ""
@@ -102,7 +107,24 @@ def shortfall(certificate: Certificate) -> str:
         return f"{row.specification} {row.worst:.4g}{unit}, required {row.relation} {row.required:.4g}{unit}{where}"
 
     missed = "; ".join(distance(row) for row in certificate.rows if not row.met)
-    return f"NOT certified. The best design found: {missed}"
+    return f"NOT certified. The best design found: {missed}{short_times(problem)}"
+
+
+def short_times(problem: DesignProblem) -> str:
+    """Say which times are few periods of the finger's resonance, and what is usual; '' for none.
+
+    A loop's times go with the period, so that what is asked of a quick finger no slower one reaches.
+    """
+    period = 2.0 * math.pi * math.sqrt(problem.finger.denominator[0])
+    found = []
+    for name, usual in USUAL_PERIODS.items():
+        asked = getattr(problem.specification, name)
+        if 0.0 < asked < 0.95 * usual * period:
+            found.append(
+                f"{name} is {asked:g} s, {asked / period:.2g} periods of the resonance of {1.0 / period:.4g} Hz, where "
+                f"`robust` has {usual:g}, here {usual * period:.3g} s"
+            )
+    return "".join(f"; {text}" for text in found)
 
 
 BLOCKS = {

@@ -26,6 +26,8 @@ DAMPED_STARTS = np.array(
 )
 """Arguments of `_damped_candidate` for one, two and three samples of delay, frequencies per resonance.
 
+A slower finger has them at more samples: what counts is the delay in periods of the resonance.
+
 By differential evolution and simplex searches over the corners of params/synthesis_robust.yaml's box.
 """
 
@@ -87,10 +89,8 @@ def shaped_weights(
 
 
 def _damped_starts(problem: DesignProblem) -> list[list[float]]:
-    """Return the best of a long search for the default finger, scaled to this one's resonance."""
-    omega = _resonance(problem)
-    delay = min(max(problem.finger.delay_samples, 1), len(DAMPED_STARTS))
-    return [(DAMPED_STARTS[delay - 1] * np.where(IS_FREQUENCY, omega, 1.0)).tolist()]
+    """Return what a long search found for the default finger, scaled to this one's resonance."""
+    return (DAMPED_STARTS * np.where(IS_FREQUENCY, _resonance(problem), 1.0)).tolist()
 
 
 def _damped_candidate(problem: DesignProblem, x: np.ndarray) -> DesignProblem:

@@ -369,8 +369,10 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
     measurements = [read(path, arguments).bridged() for path in arguments.recording]
     model = identify_drift(measurements, operator)
     fits = {
-        str(path): quality(curve[:, 1], curve[:, 2], less)
-        for path, curve, less in zip(arguments.recording, model.fitted, model.without)
+        fit.source: replace(
+            quality(fit.curve[:, 1], fit.curve[:, 2], fit.without), stroke=fit.stroke
+        )
+        for fit in model.fitted
     }
     show(console, "creep and thermal deflection", fits)
     need("creep and thermal deflection", fits, "a finger without creep and heat")
@@ -427,7 +429,7 @@ def drift(arguments: argparse.Namespace, console: Console) -> list[Path]:
         written += store(arguments.out, "hysteresis", comment, cleared)
     picture = arguments.out / "drift.png"
     plots.responses(
-        list(zip(map(str, arguments.recording), model.fitted)),
+        [(fit.source, fit.curve) for fit in model.fitted],
         lines(found, model.confidence),
         picture,
     )

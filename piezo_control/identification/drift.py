@@ -20,7 +20,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,15 @@ SMALLEST_WARMING = 1.0  # degC, to tell what depends on temperature
 LEVELS = 10  # parts of a recording whose mean temperatures count: a thermocouple's noise does not
 
 
+class Described(NamedTuple):
+    """A recording as it was fitted; of the same loop at two temperatures their difference."""
+
+    source: str
+    curve: NDArray[np.float64]  # time (s), measured and modelled (m)
+    without: NDArray[np.float64]  # the deflection (m) of a finger without creep and heat
+    stroke: float  # m, of the recording: that of the loops, where it is their difference
+
+
 @dataclass(frozen=True)
 class DriftModel:
     """Creep and thermal deflection, named as the cantilever's parameters; 0 with an interval of 0: not told."""
@@ -56,10 +66,7 @@ class DriftModel:
     gain_per_degc: float  # 1/degC, of the hysteresis
     lag_per_degc: float  # 1/degC, of its width
     creep_degc: float  # at which the creep was seen, on average; NaN: none
-    fitted: tuple[NDArray[np.float64], ...]  # per recording: time (s), measured and modelled (m)
-    without: tuple[
-        NDArray[np.float64], ...
-    ]  # the deflection (m) of a finger without both, at those times
+    fitted: tuple[Described, ...]
     confidence: Values = field(default_factory=dict)  # half widths of the 95 % intervals, by name
 
     def cleared(self, measurement: Measurement) -> Measurement:
@@ -296,16 +303,29 @@ def identify_drift(
         for grid in (times / half_step, times * half_step)
     ]
     curves = [block @ x for block in modelled(found.x)]
+
+    def alone(number: int) -> Described:
+        r, seen = recordings[number], deflections[number]
+        shown = curves[number] + np.mean(seen) - np.mean(curves[number])
+        less = straight(seen, r.static[r.kept])
+        curve = np.column_stack((r.time[r.kept], seen, shown))
+        return Described(measurements[number].source, curve, less, float(np.ptp(seen)))
+
+    def compared(first: int, second: int) -> Described:
+        seen = deflections[second] - deflections[first]
+        shown = curves[second] - curves[first]
+        time = recordings[first].time[recordings[first].kept]
+        source = f"{measurements[second].source} less {Path(measurements[first].source).name}"
+        curve = np.column_stack((time, seen, shown + np.mean(seen) - np.mean(shown)))
+        without = np.full_like(seen, np.mean(seen))
+        return Described(source, curve, without, float(np.ptp(deflections[first])))
+
     return DriftModel(
         **values(numbers),
         creep_times=tuple(times[there].tolist()),
         creep_degc=float(np.mean([np.mean(r.temperature) for r in creeping]))
         if creeping
         else np.nan,
-        fitted=tuple(
-            np.column_stack((r.time[r.kept], deflection, m + np.mean(deflection) - np.mean(m)))
-            for r, deflection, m in zip(recordings, deflections, curves)
-        ),
-        without=tuple(straight(r.deflection[r.kept], r.static[r.kept]) for r in recordings),
+        fitted=(*map(alone, single), *itertools.starmap(compared, twins)),
         confidence=intervals(values, numbers, jacobian, deviation, others=others),
     )

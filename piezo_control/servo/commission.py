@@ -419,8 +419,9 @@ def main() -> int:
     folder, certificate = found
     console.print(f"wrote {folder}", soft_wrap=True)
     if not certificate.met:
+        problem = read_problem(folder / "problem.yaml")
         print(
-            f"commission: {shortfall(certificate)}. Ask what this finger can in {folder}/problem.yaml, then: "
+            f"commission: {shortfall(certificate, problem)}. Ask what this finger can in {folder}/problem.yaml, then: "
             f"synthesize {folder}/problem.yaml --overwrite --out {folder}/feedback.yaml",
             file=sys.stderr,
         )
