@@ -251,7 +251,8 @@ def _sections(path: str | Path) -> dict[str, dict]:
     except OSError as error:
         raise ParameterError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, yaml.YAMLError) as error:
-        raise ParameterError(f"{path}: cannot be read as YAML: {error}") from None
+        words = " ".join(str(error).split())  # of several lines, with the place in the text
+        raise ParameterError(f"{path}: cannot be read as YAML: {words}") from None
     except RecursionError:
         raise ParameterError(f"{path}: cannot be read as YAML: nested too deeply") from None
     if not isinstance(content, dict):

@@ -31,6 +31,7 @@ from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes.qos import FAULTS, FOLLOWED, LATCHED, SAMPLE, SETPOINT
+from piezo_control.nodes.recorder import RecorderNode
 from piezo_control.nodes.sole_input import SoleInput
 from piezo_control.parameters import build, load
 from piezo_control.recording.reader import open_bag
@@ -489,6 +490,34 @@ def test_bad_start_parameter_ends_with_one_line(tmp_path):
     assert result.returncode == 2
     assert "voltage_high" in result.stderr and "-3000.0" in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_an_empty_list_is_refused_in_words():
+    result = subprocess.run(
+        [EXECUTABLES / "cantilever", "--ros-args", "-p", "hysteresis.weights:=[]"],
+        capture_output=True, text=True, timeout=TIMEOUT,
+    )  # fmt: skip
+    assert result.returncode == 2
+    assert result.stderr.startswith("cantilever: hysteresis.'weights' has 0 values, must have as")
+
+
+def test_a_recorder_says_what_it_cannot_record(neighbour, capfd, monkeypatch):
+    recorder = RecorderNode()
+    neighbour.node.create_publisher(Sample, "voltage", SAMPLE)
+    neighbour.wait(lambda: recorder.count_publishers("voltage"))
+    for topics, words in (
+        (["de flection"], "'topics' has 'de flection', which is no name of a topic"),
+        (["voltage", "/voltage"], "'topics' has /voltage more than once"),
+    ):
+        recorder.set_parameters([Parameter("topics", value=topics)])
+        assert recorder.trigger_configure() == TransitionCallbackReturn.FAILURE
+        assert f"not configured: {words}" in capfd.readouterr().err
+    recorder.set_parameters([Parameter("topics", value=["voltage"])])
+    assert recorder.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    monkeypatch.setattr(recorder, "start", lambda: 1 / 0)  # what rclpy would pass over
+    assert recorder.trigger_activate() == TransitionCallbackReturn.ERROR
+    assert "transition failed: ZeroDivisionError: division by zero" in capfd.readouterr().err
+    recorder.destroy_node()
 
 
 @pytest.mark.parametrize(

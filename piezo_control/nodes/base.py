@@ -103,15 +103,13 @@ class FingerNode(LifecycleNode):
         given.update((p.name, p) for p in self._promoted(list(given.values())))
         for name, (kind, field) in self._declarations.items():
             default = field.default
-            if default == ():  # an empty list shows no element type, so it is set after the type
-                declared = self.declare_parameter(
-                    name, ROS_TYPES[kind], describe(name, kind, field)
-                )
-                if declared.type_ == Parameter.Type.NOT_SET:
-                    self.set_parameters([Parameter(name, ROS_TYPES[kind], [])])
-            else:
-                value = list(default) if isinstance(default, tuple) else default
-                self.declare_parameter(name, value, describe(name, kind, field))
+            # An empty list shows no element type, as default or as what was given; it is set after the type.
+            value = list(default) if isinstance(default, tuple) else default
+            declared = self.declare_parameter(
+                name, ROS_TYPES[kind] if default == () else value, describe(name, kind, field)
+            )
+            if declared.type_ == Parameter.Type.NOT_SET:
+                self.set_parameters([Parameter(name, ROS_TYPES[kind], [])])
         self.parameters: Any = build(self.PARAMETERS, self._values({}))
         self.active = False
         self._said = ""
@@ -237,6 +235,17 @@ class FingerNode(LifecycleNode):
         except RCLError:
             self.refuse(f"transition {transition_id} is not possible in this state")
             return TransitionCallbackReturn.FAILURE
+
+    def _LifecycleNodeMixin__execute_callback(
+        self, state: int, previous: LifecycleState
+    ) -> TransitionCallbackReturn:
+        # rclpy says nothing of an error in a transition.
+        callback = self._callbacks.get(state)
+        try:
+            return callback(previous) if callback else TransitionCallbackReturn.SUCCESS
+        except Exception as error:  # whatever a transition may lead to
+            self.refuse(f"transition failed: {type(error).__name__}: {error}")
+            return TransitionCallbackReturn.ERROR
 
     def publish_diagnostics(self) -> None:
         """Publish the state of this node on `/diagnostics`."""

@@ -165,6 +165,10 @@ class RecorderParameters:
     bag: str = parameter("", "folder to write, new; empty: namespace and time, in this folder")
     topics: tuple[str, ...] = parameter(RECORDED, "topics to record, relative or absolute")
 
+    def __post_init__(self) -> None:
+        if not self.topics:
+            raise ParameterError("'topics' is empty, must name at least one topic")
+
 
 def read_feedforward(parameters: ServoNodeParameters) -> FeedforwardNodeParameters:
     """Return inverse, models and limits of a parameter file, the limits as near to rest as the share to be used says."""

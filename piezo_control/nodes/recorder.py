@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import Connection
@@ -121,8 +122,11 @@ class RecorderNode(FingerNode):
         """Subscribe, so that every publisher knows the recorder before a run begins."""
         try:
             types = {topic: self._type(topic) for topic in self.parameters.topics}
+            names = [self.resolve_topic_name(topic) for topic in self.parameters.topics]
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                raise ValueError(f"'topics' has {', '.join(twice)} more than once")
         except ValueError as error:
-            self.get_logger().error(f"not configured: {error}")
+            self.refuse(f"not configured: {error}")
             return TransitionCallbackReturn.FAILURE
         self.types = types
         for topic, (name, qos) in types.items():
@@ -202,7 +206,10 @@ class RecorderNode(FingerNode):
 
     def _type(self, topic: str) -> tuple[str, QoSProfile]:
         """Return message type and quality of service to subscribe `topic` with."""
-        offers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+        try:
+            offers = self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+        except RCLError:
+            raise ValueError(f"'topics' has '{topic}', which is no name of a topic") from None
         if topic in FINGER and not offers:
             return FINGER[topic]
         if not offers:

@@ -192,8 +192,9 @@ def _of_run(bag: Bag, prefix: str, run: int | None) -> Bag:
     number = np.array([m.number for m in bag.messages(name, kind)])
     begins = [0, *np.flatnonzero(np.diff(number) < 0) + 1]
     if run is None and len(begins) > 1 or run is not None and not 0 <= run < len(begins):
+        asked = "name one of them" if run is None else f"there is no run {run}"
         raise BagError(
-            f"{bag.path}: topic '{name}' has {len(begins)} runs (numbered from 0), and run {run} was asked for"
+            f"{bag.path}: topic '{name}' has {len(begins)} runs, numbered from 0: {asked}"
         )
     if len(begins) == 1:
         return bag
