@@ -218,8 +218,10 @@ def test_a_stop_at_rest_says_nothing(at_20_volts):
 
 def test_a_driver_that_does_not_come_back_is_told_and_keeps_its_device(at_20_volts):
     servo, card = at_20_volts
-    assert servo.stuck == ""
     card.device.hangs[0] = 1
+    asked = time.monotonic()
+    wait(lambda: time.monotonic() > asked + 0.5)
+    assert servo.stuck == ""  # nobody looked meanwhile, as of a process that stood still as a whole
     wait(lambda: servo.stuck)
     assert servo.stuck == (
         "the loop does not go on: the driver has not come back for more than 0.2 s; the voltage stays where it is, "
