@@ -266,14 +266,16 @@ def test_stopped_finger_is_at_rest_and_starts_again(finger):
 
 def test_a_finger_that_runs_free_is_stopped_and_starts_again_without_a_fault(ros, tmp_path):
     """Stopped one by one, its blocks would miss each other for longer than their hold time."""
-    words = ["-r", "__ns:=/free", "-p", "mode:=free_running", "-p", "sample_time:=0.01"]
-    with NodeProcesses({"finger": ["--ros-args", *words]}, tmp_path):
+    hold_time = 1.0  # s: other processes share this machine
+    values = f"mode:=free_running sample_time:=0.01 hold_time:={hold_time}"
+    words = [word for value in values.split() for word in ("-p", value)]
+    with NodeProcesses({"finger": ["--ros-args", "-r", "__ns:=/free", *words]}, tmp_path):
         finger = ros.finger("free")
         finger.wait_for(lambda: finger.words() == "running")
         finger.stop()
         finger.wait_for(lambda: finger.words() == "idle" and finger.state.voltage == 0.0)
         begin = time.monotonic()
-        ros.wait(lambda: time.monotonic() > begin + 0.3, lambda: "")  # three hold times
+        ros.wait(lambda: time.monotonic() > begin + 1.5 * hold_time, lambda: "")
         finger.start()
         finger.wait_for(lambda: finger.words() == "running")
         finger.set(3e-6)

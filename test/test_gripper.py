@@ -122,6 +122,23 @@ def test_fingers_that_come_no_further_have_stalled_after_the_settling_time():
     assert "+4.00 µm from the opening" in outcome.text
 
 
+def test_fingers_that_are_there_when_a_busy_machine_looks_again_have_reached_it():
+    motion, there = closing(), [10e-6, 10e-6]
+    assert motion.decide([1.5, 1.5], [5e-6, 5e-6], NO_PUSH) is None  # and then nothing for 3 s
+    outcome = decided(motion, [4.6, 4.6], there, NO_PUSH)
+    assert (outcome.success, outcome.reached_goal, outcome.stalled) == (True, True, False)
+
+
+def test_fingers_that_swing_about_the_opening_have_stalled_after_the_settling_time():
+    motion = closing()
+    swinging = [(2.0 + 0.01 * n, 10e-6 + (-1) ** n * 0.09e-6) for n in range(100)]
+    ends = [motion.decide([instant] * 2, [place, 10e-6], NO_PUSH) for instant, place in swinging]
+    (end, *_) = filter(None, ends)
+    assert not end.success and end.stalled
+    after = 0.01 * ends.index(end)
+    assert DEFAULTS.settling_time < after <= DEFAULTS.settling_time + 2.0 * REST_TIME + 0.02
+
+
 def test_force_ends_closing_when_both_fingers_are_there_and_does_not_hinder_opening():
     both, one = [1e-3, 0.95e-3], [0.0, 1e-3]
     outcome = decided(closing(), [1.5, 1.5], [5e-6, 5e-6], both)
