@@ -132,6 +132,25 @@ def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighb
     assert abs(voltages[0].value - 36.9) <= SLEW * (1 + 1e-9)
 
 
+def test_a_finger_that_leaves_its_fault_is_led_from_rest(neighbour, tmp_path):
+    """Its feedforward, which has no fault, heard commands all the while."""
+    with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3, hold_time=60.0):
+        voltages = neighbour.listen(Sample, "voltage")
+        states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+        states.publish(FingerState(phase=FingerState.RUNNING))
+        commands = Stream(neighbour, "command", 10e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 10.0)
+        states.publish(FingerState(phase=FingerState.FAULT, voltage=3.0))
+        neighbour.wait(lambda: voltages[-1].value == 3.0)
+        heard = next(commands.numbers)
+        neighbour.wait(lambda: voltages[-1].number > heard + 20)
+        assert voltages[-1].value == 3.0
+        count = len(voltages)
+        states.publish(FingerState(phase=FingerState.WAITING, voltage=3.0))
+        neighbour.wait(lambda: voltages[-1].value > 10.0)
+        assert np.abs(np.diff([v.value for v in voltages[count - 1 :]])).max() <= 0.1 + 1e-9
+
+
 @pytest.mark.shows("two publishers of an input")
 def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
     with node("feedforward", tmp_path, mode="free_running"):

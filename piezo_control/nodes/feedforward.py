@@ -208,7 +208,14 @@ class FeedforwardNode(BlockNode):
         share = min(1.0, (now - self.moved) / p.sample_time) if is_free else 1.0
         self.guard.hear(now)
         clipped = self.law.clipped
-        if isinstance(self.law, Sensorless):
+        finger = self.finger
+        if is_free and finger and finger.phase in (FingerState.RAMPING, FingerState.FAULT):
+            # It takes no voltage now, and leaps to the first one that it takes again unless that begins where it is.
+            self.law.follow(finger.voltage)
+            answer.value = self.law.voltage
+            if isinstance(self.law, Sensorless):
+                self._expect(sample)
+        elif isinstance(self.law, Sensorless):
             instant = sample.number * p.sample_time if self._is_on_grid() else now
             degc = self._read(self.law, instant)
             if self.guard.is_latched:
