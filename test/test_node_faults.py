@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
 
+from piezo_control.gripper import hold
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
@@ -567,6 +568,25 @@ def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing
     commands._on_trajectory(JointTrajectory(joint_names=["gripper_joint"]))
     node._watch()
     assert node.motion is None
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize("phase, place", [(FingerState.HOLDING, 7e-6), (FingerState.RAMPING, 0.0)])
+def test_a_finger_that_bridges_a_late_sample_lets_nothing_go(phase, place):
+    """Its reference stays; that of one on its way to rest becomes the place where it will be."""
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    finger = node.fingers[0]
+    state = FingerState(phase=FingerState.RUNNING, samples=100, period=1e-4)
+    state.deflection = state.reference = 7e-6
+    finger._take(state)
+    finger.follow(hold(7e-6))
+    state.phase = phase
+    finger._take(state)
+    assert finger.place() == pytest.approx(place)
     node.destroy_node()
     rclpy.shutdown()
 

@@ -38,7 +38,9 @@ def test_limited_is_the_nearest_voltage_that_is_allowed(low, span, change, place
 
 
 @given(volts, st.floats(0.0, 200.0), st.floats(1e-6, 50.0), volts, volts)
-def test_a_voltage_outside_its_limits_is_led_back_and_does_not_leap(low, span, change, last, wanted):
+def test_a_voltage_outside_its_limits_is_led_back_and_does_not_leap(
+    low, span, change, last, wanted
+):
     high = low + span
     voltage = limited(low, high, change, last, wanted)
     assert abs(voltage - last) <= change * (1 + 1e-12) + 1e-12
