@@ -152,6 +152,22 @@ def test_a_finger_that_leaves_its_fault_is_led_from_rest(neighbour, tmp_path):
         assert np.abs(np.diff([v.value for v in voltages[count - 1 :]])).max() <= 0.1 + 1e-9
 
 
+@pytest.mark.shows("a value that is not finite or that no finger reaches")
+@pytest.mark.parametrize("nonsense", [math.nan, 1e30])
+def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, nonsense):
+    with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3):
+        voltages = neighbour.listen(Sample, "voltage")
+        states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+        states.publish(FingerState(phase=FingerState.RUNNING, voltage=nonsense))
+        Stream(neighbour, "command", 10e-6)
+        neighbour.wait(
+            lambda: f"'state' has a voltage of {nonsense} V" in log(tmp_path, "feedforward")
+        )
+        states.publish(FingerState(phase=FingerState.RUNNING, voltage=5.0))
+        neighbour.wait(lambda: voltages)
+    assert voltages[0].value == pytest.approx(5.1)  # V: the slew limit of a sample further
+
+
 @pytest.mark.shows("two publishers of an input")
 def test_two_publishers_are_a_named_fault(neighbour, tmp_path):
     with node("feedforward", tmp_path, mode="free_running"):
