@@ -294,9 +294,10 @@ class ServoNode(FingerNode):
         if wrong == complaint:
             return
         if wrong:
-            self.get_logger().error(
-                f"{wrong}; the models go on with the temperature that they have"
-            )
+            then = "the models go on with the temperature that they have"
+            if self.thermometer.ends:
+                then = "that ends at rest"
+            self.get_logger().error(f"{wrong}; {then}")
         else:
             self.get_logger().info(f"temperature is back: {self.thermometer.degc:g} °C")
         self.publish_diagnostics()
