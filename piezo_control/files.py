@@ -17,7 +17,7 @@ from typing import Any
 def replaced(*paths: Path) -> Iterator[list[Path]]:
     """Yield a place beside each path to write to; all take the paths' places when all went well.
 
-    Where a path is a link, the file it leads to is replaced.
+    Where a path is a link, the file it leads to is replaced. An OSError names the paths, which that of a full disk does not.
     """
     wanted = [path.resolve() for path in paths]
     written = [path.with_name(f".{os.getpid()}.{path.name}") for path in wanted]
@@ -25,6 +25,10 @@ def replaced(*paths: Path) -> Iterator[list[Path]]:
         yield written
         for place, path in zip(written, wanted):
             place.replace(path)
+    except OSError as error:
+        if error.filename is None:
+            error.filename = ", ".join(map(str, paths))
+        raise
     finally:
         for place in written:
             place.unlink(missing_ok=True)

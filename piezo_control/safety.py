@@ -95,8 +95,12 @@ def limits(voltage: VoltageParameters, ramp: float) -> Limits:
 
 
 def limited(low: float, high: float, change: float, last: float, wanted: float) -> float:
-    """Return `wanted` (V) within [low, high] and no further than `change` (V) from `last` (V)."""
-    return min(high, last + change, max(low, last - change, wanted))
+    """Return `wanted` (V) within [low, high] and no further than `change` (V) from `last` (V).
+
+    A `last` outside [low, high], as of limits that are narrower than where the finger was left, is led there by
+    `change` at a time: a leap destroys sooner than a voltage that was there before.
+    """
+    return min(last + change, max(last - change, min(high, max(low, wanted))))
 
 
 def toward(rest: float, step: float, voltage: float) -> float:

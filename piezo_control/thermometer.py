@@ -57,12 +57,22 @@ class Thermometer:
         """What was wrong at the last reading; empty: nothing."""
         self._heard = self._changed = now
 
+    @property
+    def ends(self) -> str:
+        """What is wrong at the last reading and ends at rest; empty: nothing, or the models go on."""
+        return self.wrong if self.parameters.fallback == "fault" else ""
+
     def hear(self, degc: float, now: float) -> None:
         """Take a finite temperature (°C)."""
         if degc != self.degc:
             self._changed = now
         self.degc = degc
         self._heard = now
+
+    def check(self) -> None:
+        """Raise ValueError if what was wrong at the last reading would end at rest again."""
+        if self.ends:
+            raise ValueError(f"{self.ends}, and 'thermometer.fallback' is 'fault'")
 
     def read(self, now: float) -> float:
         """Return the temperature (°C), NaN when it cannot be believed; `wrong` says why."""

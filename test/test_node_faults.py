@@ -25,6 +25,7 @@ from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
 
+from piezo_control.gripper import hold
 from piezo_control.nodes import base
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
@@ -130,6 +131,41 @@ def test_a_restarted_feedforward_goes_on_from_the_voltage_that_is_applied(neighb
         states.publish(FingerState(phase=FingerState.RUNNING, samples=1000, voltage=36.9))
         neighbour.wait(lambda: voltages)
     assert abs(voltages[0].value - 36.9) <= SLEW * (1 + 1e-9)
+
+
+def test_a_finger_that_leaves_its_fault_is_led_from_rest(neighbour, tmp_path):
+    """Its feedforward, which has no fault, heard commands all the while."""
+    with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3, hold_time=60.0):
+        voltages = neighbour.listen(Sample, "voltage")
+        states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+        states.publish(FingerState(phase=FingerState.RUNNING))
+        commands = Stream(neighbour, "command", 10e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 10.0)
+        states.publish(FingerState(phase=FingerState.FAULT, voltage=3.0))
+        neighbour.wait(lambda: voltages[-1].value == 3.0)
+        heard = next(commands.numbers)
+        neighbour.wait(lambda: voltages[-1].number > heard + 20)
+        assert voltages[-1].value == 3.0
+        count = len(voltages)
+        states.publish(FingerState(phase=FingerState.WAITING, voltage=3.0))
+        neighbour.wait(lambda: voltages[-1].value > 10.0)
+        assert np.abs(np.diff([v.value for v in voltages[count - 1 :]])).max() <= 0.1 + 1e-9
+
+
+@pytest.mark.shows("a value that is not finite or that no finger reaches")
+@pytest.mark.parametrize("nonsense", [math.nan, 1e30])
+def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, nonsense):
+    with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3):
+        voltages = neighbour.listen(Sample, "voltage")
+        states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+        states.publish(FingerState(phase=FingerState.RUNNING, voltage=nonsense))
+        Stream(neighbour, "command", 10e-6)
+        neighbour.wait(
+            lambda: f"'state' has a voltage of {nonsense} V" in log(tmp_path, "feedforward")
+        )
+        states.publish(FingerState(phase=FingerState.RUNNING, voltage=5.0))
+        neighbour.wait(lambda: voltages)
+    assert voltages[0].value == pytest.approx(5.1)  # V: the slew limit of a sample further
 
 
 @pytest.mark.shows("two publishers of an input")
@@ -548,6 +584,25 @@ def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing
     commands._on_trajectory(JointTrajectory(joint_names=["gripper_joint"]))
     node._watch()
     assert node.motion is None
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize("phase, place", [(FingerState.HOLDING, 7e-6), (FingerState.RAMPING, 0.0)])
+def test_a_finger_that_bridges_a_late_sample_lets_nothing_go(phase, place):
+    """Its reference stays; that of one on its way to rest becomes the place where it will be."""
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    finger = node.fingers[0]
+    state = FingerState(phase=FingerState.RUNNING, samples=100, period=1e-4)
+    state.deflection = state.reference = 7e-6
+    finger._take(state)
+    finger.follow(hold(7e-6))
+    state.phase = phase
+    finger._take(state)
+    assert finger.place() == pytest.approx(place)
     node.destroy_node()
     rclpy.shutdown()
 

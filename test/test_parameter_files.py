@@ -149,7 +149,7 @@ def test_a_full_disk_leaves_the_file_of_before(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=f"No space left on device: '{path}'"):
         dump(path, "feedback", {"sample_time": 1e-2})
     assert path.read_text() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["link.yaml", "mine.yaml"]

@@ -37,6 +37,17 @@ def test_limited_is_the_nearest_voltage_that_is_allowed(low, span, change, place
         assert voltage == wanted
 
 
+@given(volts, st.floats(0.0, 200.0), st.floats(1e-6, 50.0), volts, volts)
+def test_a_voltage_outside_its_limits_is_led_back_and_does_not_leap(
+    low, span, change, last, wanted
+):
+    high = low + span
+    voltage = limited(low, high, change, last, wanted)
+    assert abs(voltage - last) <= change * (1 + 1e-12) + 1e-12
+    outside = [max(low - v, v - high, 0.0) for v in (last, voltage)]
+    assert outside[1] == 0.0 or outside[1] < outside[0]
+
+
 @given(volts, st.floats(0.0, 100.0), volts)
 def test_toward_rest_never_passes_it(rest, step, voltage):
     nearer = toward(rest, step, voltage)

@@ -9,6 +9,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import Temperature
+from std_srvs.srv import Trigger
 from test_nodes import neighbour
 
 from piezo_control.adaptation import AdaptationParameters
@@ -61,6 +62,14 @@ class Loop:
         self.wait(lambda: number in self.voltages)
         self.node.destroy_timer(send)
         return self.voltages[number]
+
+    def reset(self):
+        """Ask the node to leave its fault; return its answer."""
+        client = self.node.create_client(Trigger, "feedforward/reset")
+        self.wait(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.wait(future.done)
+        return future.result()
 
     def _on_voltage(self, message):
         self.voltages[message.number] = message
@@ -150,6 +159,11 @@ def test_a_missing_temperature_is_named_and_the_last_one_goes_on_or_the_finger_r
             number = max(loop.voltages, default=-1) + 1
         loop.wait(lambda: loop.voltages[max(loop.voltages)].value == 0.0)
         assert loop.said[""] == "temperature missing: none for 0.3 s"
+        refused = loop.reset()
+        assert not refused.success
+        assert refused.message == f"{loop.said['']}, and 'thermometer.fallback' is 'fault'"
+        loop.warm(0, 26.0)
+        loop.wait(lambda: loop.reset().success)
         return
     loop.wait(lambda: loop.ask(max(loop.voltages, default=-1) + 1, 10e-6).without_temperature)
     log = (tmp_path / "feedforward.log").read_text()

@@ -222,6 +222,7 @@ def test_a_reset_without_a_temperature_moves_nothing(tmp_path):
         assert finger.state.times == 1
     log = (tmp_path / "servo.log").read_text()
     assert "with force control" in log and "robust" not in log
+    assert "none for 0.01 s; that ends at rest" in log and "models go on" not in log
 
 
 @contextmanager

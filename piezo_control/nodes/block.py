@@ -13,6 +13,7 @@ and its `state` says why.
 
 from __future__ import annotations
 
+import math
 import time
 from typing import Any
 
@@ -24,7 +25,7 @@ from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, NEWEST, SAMPLE
 from piezo_control.nodes.sample_output import SampleOutput
 from piezo_control.nodes.sole_input import SoleInput
-from piezo_control.safety import Guard, is_physical
+from piezo_control.safety import LARGEST_DEFLECTION, LARGEST_VOLTAGE, Guard, is_physical
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 
@@ -86,7 +87,7 @@ class BlockNode(FingerNode):
         self._answers = False
         self._waiting: tuple[Sample, str] | None = None  # a sample, and what it waits for
         self.finger: FingerState | None = None
-        self.create_subscription(FingerState, "state", self._on_state, LATCHED)
+        self.create_subscription(FingerState, "state", self._hear_state, LATCHED)
         self._input = SoleInput(
             self, self.INPUT, self._on_sample, self._quality(), self._look_at_input
         )
@@ -162,6 +163,26 @@ class BlockNode(FingerNode):
     def _look_at_input(self) -> None:
         if self.active and (wrong := self._input.wrong()):
             self.trip(wrong)
+
+    def _hear_state(self, state: FingerState) -> None:
+        """Take a state, unless nonsense is in what a block begins with; a reference may be unknown."""
+        values = (
+            ("voltage", "V", state.voltage, LARGEST_VOLTAGE),
+            (
+                "reference",
+                "m",
+                0.0 if math.isnan(state.reference) else state.reference,
+                LARGEST_DEFLECTION,
+            ),
+        )
+        for name, unit, value, largest in values:
+            if not is_physical(value, largest):
+                self.get_logger().error(
+                    f"'state' has a {name} of {value} {unit}, must be finite and within ±{largest:g} {unit}; ignored",
+                    throttle_duration_sec=1.0,
+                )
+                return
+        self._on_state(state)
 
     def _on_state(self, state: FingerState) -> None:
         self.finger = state

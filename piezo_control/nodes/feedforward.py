@@ -86,6 +86,7 @@ class FeedforwardNode(BlockNode):
         self.moved = time.monotonic()
         self.thermometer = Thermometer(self.parameters.thermometer, self.moved)
         self._temperatures.clear()
+        self._complained = ""
         told = Dynamics()
         if self.parameters.compensator == "sensorless":
             self._temperature_input = TemperatureInput(self, self._on_temperature)
@@ -189,13 +190,13 @@ class FeedforwardNode(BlockNode):
             self._complained = self.thermometer.wrong
             if not self._complained:
                 self.get_logger().info(f"temperature is back: {degc:g} °C")
-            elif self.parameters.thermometer.fallback == "fault":
-                self.trip(self._complained)
-            else:
+            elif not self.thermometer.ends:
                 self.get_logger().error(
                     f"{self._complained}; the models go on with {law.body_degc:g} °C"
                 )
             self.publish_diagnostics()
+        if self.thermometer.ends:
+            self.trip(self.thermometer.ends)
         return degc
 
     # --- samples ------------------------------------------------------------------------------------
@@ -207,7 +208,14 @@ class FeedforwardNode(BlockNode):
         share = min(1.0, (now - self.moved) / p.sample_time) if is_free else 1.0
         self.guard.hear(now)
         clipped = self.law.clipped
-        if isinstance(self.law, Sensorless):
+        finger = self.finger
+        if is_free and finger and finger.phase in (FingerState.RAMPING, FingerState.FAULT):
+            # It takes no voltage now, and leaps to the first one that it takes again unless that begins where it is.
+            self.law.follow(finger.voltage)
+            answer.value = self.law.voltage
+            if isinstance(self.law, Sensorless):
+                self._expect(sample)
+        elif isinstance(self.law, Sensorless):
             instant = sample.number * p.sample_time if self._is_on_grid() else now
             degc = self._read(self.law, instant)
             if self.guard.is_latched:
@@ -255,6 +263,9 @@ class FeedforwardNode(BlockNode):
         return wrong, figures
 
     def reset(self) -> None:
+        if self._temperature_input and not self._is_on_grid():
+            self.thermometer.read(time.monotonic())
+            self.thermometer.check()  # it would move the finger until the fault comes back
         super().reset()
         self.moved = time.monotonic()
 

@@ -284,7 +284,9 @@ class Finger:
             is_late = self.heard - self._sent > UNDER_WAY
             if is_late or self._shows(self._under_way) or not any(map(self._shows, self._before)):
                 self._under_way = None  # it is there, or somebody else's: the state knows better
-        if self.reference is not None and (restarted or state.phase != FingerState.RUNNING):
+        # One that holds bridges a late sample, and goes on where its reference is: it may have an object.
+        goes_on = state.phase in (FingerState.RUNNING, FingerState.HOLDING)
+        if self.reference is not None and (restarted or not goes_on):
             self.follow(hold(0.0))
             self.reference = self._node.goal = None
         self._on_state(self)

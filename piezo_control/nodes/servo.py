@@ -242,9 +242,8 @@ class ServoNode(FingerNode):
                 self._say_origins()
 
     def reset(self) -> None:
-        if self._ends_without_temperature():
-            # It would move the finger until the fault comes back.
-            raise ValueError(f"{self.thermometer.wrong}, and 'thermometer.fallback' is 'fault'")
+        if self._temperature_input:
+            self.thermometer.check()  # it would move the finger until the fault comes back
         if self.servo:
             self.servo.reset()
 
@@ -290,24 +289,18 @@ class ServoNode(FingerNode):
         complaint = self.thermometer.wrong
         servo.feel(self.thermometer.read(time.monotonic()))
         wrong = self.thermometer.wrong
-        if self._ends_without_temperature():
+        if self.thermometer.ends:
             servo.give_up_without_temperature()
         if wrong == complaint:
             return
         if wrong:
-            self.get_logger().error(
-                f"{wrong}; the models go on with the temperature that they have"
-            )
+            then = "the models go on with the temperature that they have"
+            if self.thermometer.ends:
+                then = "that ends at rest"
+            self.get_logger().error(f"{wrong}; {then}")
         else:
             self.get_logger().info(f"temperature is back: {self.thermometer.degc:g} °C")
         self.publish_diagnostics()
-
-    def _ends_without_temperature(self) -> bool:
-        """Say whether the temperature is missing to a finger that must not go on without it."""
-        is_needed = (
-            bool(self._temperature_input) and self.parameters.thermometer.fallback == "fault"
-        )
-        return is_needed and bool(self.thermometer.wrong)
 
     def _rate(self) -> float:
         """Return how many samples a second were served lately."""
