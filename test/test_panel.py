@@ -53,6 +53,19 @@ def filled(count, **signals):
     return history
 
 
+def test_command_line():
+    for words, code, said in (
+        (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: [Errno 99] Cannot assign"),
+        (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
+        (["-f", "bad name"], 2, "panel: error: 'bad name' cannot be: namespace must not contain"),
+    ):
+        done = subprocess.run(
+            [EXECUTABLES / "panel", *words], capture_output=True, text=True, timeout=TIMEOUT
+        )
+        assert done.returncode == code
+        assert said in done.stderr and "Traceback" not in done.stderr
+
+
 def test_history_keeps_the_newest_rows_and_leaves_out_the_same_ones_however_it_is_asked():
     history = History(("clock", "number"), 100)
     for index in range(250):
@@ -587,16 +600,3 @@ def test_page_fits_the_screen_in_light_and_dark(panel, browser, width, height, s
     brightness = np.mean([int(part) for part in paper[4:-1].split(",")])
     assert (brightness < 128) == dark
     context.close()
-
-
-def test_command_line():
-    for words, code, said in (
-        (["--host", "192.0.2.1"], 1, "panel: no page on 192.0.2.1:5006: [Errno 99] Cannot assign"),
-        (["-f", "a", "-f", "b", "-f", "c"], 2, "3 fingers are named, a page shows 2"),
-        (["-f", "bad name"], 2, "panel: error: 'bad name' cannot be: namespace must not contain"),
-    ):
-        done = subprocess.run(
-            [EXECUTABLES / "panel", *words], capture_output=True, text=True, timeout=TIMEOUT
-        )
-        assert done.returncode == code
-        assert said in done.stderr and "Traceback" not in done.stderr
