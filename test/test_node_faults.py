@@ -665,3 +665,17 @@ def test_a_signal_between_any_two_steps_of_the_handler_of_another_is_heard(tmp_p
     )
     assert ended.returncode == 0, ended.stderr
     assert int(ended.stdout.removeprefix("at rest, interrupted ")) > 3
+
+
+def test_a_timer_that_was_due_when_it_was_cancelled_or_destroyed_does_nothing(neighbour):
+    """An executor of events serves it still when its event was on the way."""
+    owner = FeedforwardNode()
+    called = []
+    timer = owner.create_steady_timer(10.0, lambda: called.append(True))
+    timer.callback()
+    timer.cancel()
+    timer.callback()
+    owner.destroy_timer(timer)
+    timer.callback()
+    owner.destroy_node()
+    assert called == [True]

@@ -81,8 +81,11 @@ class Neighbour:
 
     def insist(self, publisher, message, done, period=0.05):
         """Publish again and again until `done()`, as what is sent before the endpoints match is lost."""
-        timer = self.node.create_timer(period, lambda: publisher.publish(message))
+        over = False
+        # A timer that is due when it is destroyed is served still, now and then: its sample would begin a new run.
+        timer = self.node.create_timer(period, lambda: over or publisher.publish(message))
         self.wait(done)
+        over = True
         self.node.destroy_timer(timer)
 
     def ask_sample(self, publisher, message, answers):

@@ -57,9 +57,11 @@ class Loop:
     def ask(self, number, value, by_controller=False):
         """Send a command again and again until its voltage is there; return that."""
         asked = Sample(number=number, value=value, by_controller=by_controller)
-        send = self.node.create_timer(0.05, lambda: self.command.publish(asked))
+        over = False  # a timer that is due when it is destroyed is served still, now and then
+        send = self.node.create_timer(0.05, lambda: over or self.command.publish(asked))
         self.command.publish(asked)
         self.wait(lambda: number in self.voltages)
+        over = True
         self.node.destroy_timer(send)
         return self.voltages[number]
 

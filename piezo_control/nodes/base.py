@@ -23,7 +23,11 @@ from rcl_interfaces.msg import (
 )
 from rclpy._rclpy_pybind11 import RCLError, RCLInvalidROSArgsError, UnknownROSArgsError
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.exceptions import (
+    InvalidHandle,
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+)
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.timer import Timer
@@ -129,8 +133,19 @@ class FingerNode(LifecycleNode):
         self, period: float, callback: Callable[[], None], autostart: bool = True
     ) -> Timer:
         """Return a timer (s) that neither simulated time nor a change of the system's clock can stop."""
+
+        def due() -> None:
+            # One that was due when it was cancelled, or destroyed, is served still, now and then.
+            try:
+                is_over = timer.is_canceled()
+            except InvalidHandle:
+                is_over = True
+            if not is_over:
+                callback()
+
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        return self.create_timer(period, callback, clock=steady, autostart=autostart)
+        timer = self.create_timer(period, due, clock=steady, autostart=autostart)
+        return timer
 
     def say(self, text: str) -> None:
         """Log what the node does from now on, or waits for; the same again is not said twice."""
