@@ -229,9 +229,7 @@ class Motion:
         self._arrivals = [math.inf] * len(references)
         self._stall_times = [REST_TIME] * len(references)
         self._places = [(math.inf, math.nan)] * len(references)  # since when (s) a tip is where (m)
-        self._overdue = (
-            math.inf
-        )  # when (s after the ramp) the settling time was first seen to be over
+        self._overdue = math.inf  # s after the ramp, when the settling time was first seen over
 
     def departed(self, finger: int) -> bool:
         """Tell whether `depart` was called for this finger."""

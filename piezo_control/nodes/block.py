@@ -166,14 +166,10 @@ class BlockNode(FingerNode):
 
     def _hear_state(self, state: FingerState) -> None:
         """Take a state, unless nonsense is in what a block begins with; a reference may be unknown."""
+        reference = 0.0 if math.isnan(state.reference) else state.reference
         values = (
             ("voltage", "V", state.voltage, LARGEST_VOLTAGE),
-            (
-                "reference",
-                "m",
-                0.0 if math.isnan(state.reference) else state.reference,
-                LARGEST_DEFLECTION,
-            ),
+            ("reference", "m", reference, LARGEST_DEFLECTION),
         )
         for name, unit, value, largest in values:
             if not is_physical(value, largest):
