@@ -480,21 +480,23 @@ def test_silent_finger_aborts_the_goal(bench):
     assert "finger 'left' is silent: nothing on '/left/state'" in bench.log.read_text()
 
 
-@pytest.mark.parametrize("end", ["deactivation", "SIGINT"])
+@pytest.mark.parametrize("end", ["deactivation", "SIGINT", "SIGINT before the client asks"])
 def test_stopped_gripper_holds_and_lets_the_client_know(bench, end):
-    felt = []
-    handle = bench.send(10e-6, 0.0, SLOW, feedback=felt.append)
+    handle = bench.send(10e-6, 0.0, SLOW)
     bench.moving(handle)
-    result = handle.get_result_async()
-    felt.clear()
-    bench.wait(lambda: len(felt) > 2)  # by then the gripper knows that somebody wants the result
-    if end == "deactivation":
+    if end == "SIGINT before the client asks":
+        bench.processes["gripper"].send_signal(signal.SIGINT)
+        bench.wait(lambda: "the gripper is stopped" in bench.log.read_text())
+        result = handle.get_result_async()
+    elif end == "SIGINT":
+        result = handle.get_result_async()
+        bench.processes["gripper"].send_signal(signal.SIGINT)
+    else:
+        result = handle.get_result_async()
         change = bench.node.create_client(ChangeState, "gripper/change_state")
         bench.wait(change.service_is_ready)
         request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
         assert bench.result_of(change.call_async(request)).success
-    else:
-        bench.processes["gripper"].send_signal(signal.SIGINT)
     assert bench.result_of(result).status == GoalStatus.STATUS_ABORTED
     assert all(-1e-6 < reference < 14e-6 for reference in bench.held())
     if end == "deactivation":

@@ -50,6 +50,7 @@ from piezo_control.safety import PHASES, Guard
 from piezo_control.start import stop_at_signals
 
 DIAGNOSTICS_PERIOD = 1.0  # s
+FAREWELL = 2.0  # s: so long the end of a program waits for those who have still to be told
 
 ROS_TYPES = {
     bool: Parameter.Type.BOOL,
@@ -198,6 +199,10 @@ class FingerNode(LifecycleNode):
 
     def stop(self) -> None:
         """Leave the finger safe, when activity ends for whatever reason, or `start` has failed half-way."""
+
+    def is_told(self) -> bool:
+        """Say whether everyone knows how it ended who asked the node for something, after `stop`."""
+        return True
 
     def apply(self) -> None:
         """Take up changed `self.parameters` while active."""
@@ -394,7 +399,12 @@ def run(*node_types: type[FingerNode]) -> int:
                     node.trigger_activate()
             else:
                 node.say("waits to be configured and activated, as by `fingerctl lifecycle`")
-        spin.spin(nodes, stop.is_set)
+        with spin.serving(nodes) as serve:
+            serve(stop.is_set)
+            for node in reversed(nodes):
+                node.trigger_shutdown()
+            end = time.monotonic() + FAREWELL
+            serve(lambda: time.monotonic() > end or all(node.is_told() for node in nodes))
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
         name, text = node_types[min(len(nodes), len(node_types) - 1)].NAME, str(error)
         if files := [path for path in parameter_files() if path not in text]:

@@ -46,7 +46,6 @@ from piezo_control.gripper import (
     opening_of,
 )
 from piezo_control.nodes import base as finger_node
-from piezo_control.nodes import spin
 from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.faces.actions import ActionFace, GripFace
 from piezo_control.nodes.faces.asker import Asker, Measured
@@ -301,6 +300,7 @@ class GripperNode(FingerNode):
         self.fingers: list[Finger] = []
         self.motion: Motion | None = None
         self.asker: Asker | None = None  # whose motion it is
+        self._stopped: Asker | None = None  # whose motion the node's end has ended
         self.goal: Goal | None = None  # the newest, until the fingers are somewhere else
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
         self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
@@ -336,18 +336,23 @@ class GripperNode(FingerNode):
             for index, name in enumerate(self.parameters.fingers)
         ]
         self.faces = [JointStates(self), JointCommands(self), Services(self)]
+        self._stopped = None
         self.watchdog.reset()
 
     def stop(self) -> None:
         self.watchdog.cancel()
         self.active = False  # no goal from here on
         if self.asker is not None:
-            self._give_up(self.asker)
+            self._stopped = self.asker
+            self.halt("the gripper is stopped")
         for face in self.faces:
             face.destroy()
         for finger in self.fingers:
             finger.release()
         self.fingers = []
+
+    def is_told(self) -> bool:
+        return self._stopped is None or self._stopped.is_told()
 
     def reset(self) -> None:
         """Let both fingers leave their faults."""
@@ -480,19 +485,6 @@ class GripperNode(FingerNode):
                     place = min(place, finger.deflection + ahead)
                 finger.follow(hold(place))
         self._finish(outcome)
-
-    def _give_up(self, asker: Asker) -> None:
-        """End the motion because the node stops."""
-
-        def ended() -> bool:
-            if self.asker is asker:
-                self.halt("the gripper is stopped")
-            return asker.is_told()
-
-        if self.executor is None:  # a signal has ended the loop; a client still needs its result
-            spin.spin([self], ended)
-        else:
-            ended()
 
     def _finish(self, outcome: Outcome) -> None:
         """End the motion, if there is one, and tell whose it was."""

@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import rclpy
 from rclpy.experimental.events_executor import EventsExecutor
@@ -36,14 +37,23 @@ def init(args: list[str] | None = None) -> None:
     rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
 
 
-def spin(nodes: Sequence[Node], done: Callable[[], bool]) -> None:
-    """Serve the events of `nodes` in this thread until `done()`, looked at after every event."""
+@contextmanager
+def serving(nodes: Sequence[Node]) -> Iterator[Callable[[Callable[[], bool]], None]]:
+    """Give `serve(done)`, which serves the events of `nodes` in this thread until `done()`.
+
+    `done` is looked at after every event. What has been taken off the network and waits for its turn when
+    `serve` ends is served by the next one, so that a request in front of a signal is still answered.
+    """
     gc.freeze()  # modules and entities stay; the collector need not visit them between samples
     executor = EventsExecutor()
     for node in nodes:
         executor.add_node(node)
-    try:
+
+    def serve(done: Callable[[], bool]) -> None:
         while not done():
             executor.spin_once(timeout_sec=LONGEST_WAIT)
+
+    try:
+        yield serve
     finally:
         executor.shutdown()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
+from rclpy.task import Future
 
 from piezo_control.gripper import Outcome
 from piezo_control.nodes.faces.asker import Asker, Measured
@@ -25,13 +26,20 @@ class DeferredActionServer(ActionServer):
 
     An execute callback that waits would stop the node's only thread, and one that awaits is polled by
     rclpy 7's executors without a pause (measured: a full core). Here `execute()` only says EXECUTING.
+    A goal leaves the active states some events before its result goes out, so `sent` keeps the result that did.
     """
+
+    sent: Any = None  # the newest result that a client was given
 
     def notify_execute(
         self, goal_handle: ServerGoalHandle, execute_callback: Callable | None
     ) -> None:
         if execute_callback is not None:
             super().notify_execute(goal_handle, execute_callback)
+
+    def _send_result_response(self, request_header: Any, future: Future) -> None:
+        super()._send_result_response(request_header, future)
+        self.sent = future.result().result
 
 
 class ActionFace:
@@ -95,13 +103,14 @@ class ActionGoal(Asker):
     def __init__(self, face: ActionFace, handle: ServerGoalHandle) -> None:
         self.handle = handle
         self._face = face
+        self._result: Any = None  # None until the end
 
     def feel(self, measured: Measured) -> None:
         self.handle.publish_feedback(self._face.feedback(measured))
 
     def end(self, outcome: Outcome, measured: Measured) -> None:
         """Let the client know, in an event of its own: a cancellation is accepted first, then carried out."""
-        result = self._face.result(outcome, measured)
+        self._result = self._face.result(outcome, measured)
 
         def conclude(handle: ServerGoalHandle) -> Any:
             if self._face.is_success(outcome):
@@ -110,12 +119,12 @@ class ActionGoal(Asker):
                 handle.canceled()
             else:
                 handle.abort()
-            return result
+            return self._result
 
         self._face.server.notify_execute(self.handle, conclude)
 
     def is_told(self) -> bool:
-        return not self.handle.is_active
+        return self._result is not None and self._face.server.sent is self._result
 
 
 class GripFace(ActionFace):
