@@ -6,7 +6,9 @@ One goal at a time; a new one takes over from the moving fingers, and the old on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -20,6 +22,10 @@ from piezo_gripper_msgs.action import Grip
 if TYPE_CHECKING:
     from piezo_control.nodes.gripper import GripperNode
 
+ON_ITS_WAY = (
+    1.0  # s: what a server has sent is lost when its program ends before a busy client has read it
+)
+
 
 class DeferredActionServer(ActionServer):
     """An action server whose goals are moved on by events; `notify_execute` with a callback ends one.
@@ -30,6 +36,7 @@ class DeferredActionServer(ActionServer):
     """
 
     sent: Any = None  # the newest result that a client was given
+    sent_at = math.inf  # s of the steady clock
 
     def notify_execute(
         self, goal_handle: ServerGoalHandle, execute_callback: Callable | None
@@ -39,7 +46,7 @@ class DeferredActionServer(ActionServer):
 
     def _send_result_response(self, request_header: Any, future: Future) -> None:
         super()._send_result_response(request_header, future)
-        self.sent = future.result().result
+        self.sent, self.sent_at = future.result().result, monotonic()
 
 
 class ActionFace:
@@ -124,7 +131,9 @@ class ActionGoal(Asker):
         self._face.server.notify_execute(self.handle, conclude)
 
     def is_told(self) -> bool:
-        return self._result is not None and self._face.server.sent is self._result
+        server = self._face.server
+        is_sent = self._result is not None and server.sent is self._result
+        return is_sent and monotonic() - server.sent_at > ON_ITS_WAY
 
 
 class GripFace(ActionFace):
