@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import rclpy
+from fault_plant import LED
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
@@ -27,7 +28,7 @@ from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 NODES = ("feedforward", "feedback", "cantilever")
 SENDERS = {"deflection": "cantilever", "command": "feedback", "voltage": "feedforward"}
 STANDS = VoltageParameters()
-SLEW = 1e3  # V/s, running free, where the default of 40 V/ms is no limit at 5 ms a sample
+SLEW = 1e3  # V/s of the amplifier, running free, where 40 V/ms is no limit at 5 ms a sample
 
 
 class Network:
@@ -233,8 +234,8 @@ def finger(
     else:
         for words in arguments.values():
             words += ["-p", "mode:=free_running", "-p", "sample_time:=0.005"]
-        arguments["feedforward"] += ["-p", f"slew_limit:={SLEW}"]
-        arguments["cantilever"] += ["-p", f"amplifier.slew_limit:={SLEW}"]
+        arguments["feedforward"] += ["-p", f"slew_limit:={LED}"]
+        arguments["cantilever"] += ["-p", f"amplifier.slew_limit:={SLEW}", "-p", f"ramp:={LED}"]
     if linked:
         arguments[SENDERS[linked]] += ["-r", f"{linked}:={linked}_sent"]
     # Another network is reached beyond this machine's own loopback.

@@ -24,7 +24,7 @@ from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import Trigger
 
 from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_gripper_msgs.msg import Sample
+from piezo_gripper_msgs.msg import FingerState, Sample
 
 NONSENSE = (math.nan, math.inf, -1e300, 1e6, 20.0, 5e-324)
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
@@ -45,6 +45,21 @@ def halt(bench: Bench) -> None:
     process.send_signal(signal.SIGSTOP)
     bench.wait(bench.draw.choice((0.02, 0.3, 1.0)))
     process.send_signal(signal.SIGCONT)
+
+
+def hurry(bench: Bench) -> None:
+    """The feedforward stands still until the finger goes to rest, and somebody resets the finger on its way there."""
+    client = bench.node.create_client(Trigger, "cantilever/reset")
+    bench.wait(1.0, client.service_is_ready)
+    bench.wait(2.0, lambda: bench.deflection > 5e-6)  # on its way to the target of the campaign
+    process = bench.processes.running["feedforward"]
+    process.send_signal(signal.SIGSTOP)
+    bench.wait(1.0, lambda: bench.finger.phase == FingerState.RAMPING)
+    bench.wait(bench.draw.choice((0.0, 0.2)))
+    process.send_signal(signal.SIGCONT)
+    bench.wait(bench.draw.choice((0.0, 0.01)))
+    bench.wait(1.0, client.call_async(Trigger.Request()).done)
+    bench.node.destroy_client(client)
 
 
 def end(bench: Bench) -> None:
@@ -183,4 +198,4 @@ def cut(bench: Bench) -> None:
     bench.processes.network.set("up")
 
 
-ALWAYS = (halt, end, restart, transition, parameter, ask, intrude, misfit, refer, flood)
+ALWAYS = (halt, hurry, end, restart, transition, parameter, ask, intrude, misfit, refer, flood)

@@ -10,6 +10,9 @@ from piezo_sim.nodes.cantilever import CantileverNode
 from piezo_sim.plant.cantilever import Cantilever
 
 STANDS = VoltageParameters()
+LED = 50.0  # V/s: slew limit of the feedforward that runs free
+LATE = 0.05  # s that a busy machine adds
+LEAP = "leap"  # a second publisher of voltages may ask for one
 FARTHEST = 66e-6  # m: where a step over the whole reach of 44 µm overshoots to, undamped, from its end at 22 µm
 
 
@@ -17,7 +20,8 @@ class Witness(Cantilever):
     """A cantilever that looks at every sample: limits, slew in time, finite numbers.
 
     The voltage comes from a feedforward, limited to `STANDS.slew_limit`; running free, messages may come in
-    a burst, and it is the amplifier that keeps the slew in time.
+    a burst, and it is the amplifier that keeps the slew in time. What the feedforward asks for may be no
+    further away than it could lead the voltage while a message or a `state` was on its way.
     """
 
     def __init__(self, parameters):
@@ -43,6 +47,13 @@ class Witness(Cantilever):
 
 
 class WitnessedNode(CantileverNode):
+    def _take(self, voltage):
+        super()._take(voltage)
+        leap = abs(voltage.value - self.plant.voltage)
+        late = self.parameters.age_limit + self.parameters.state_period + LATE
+        if self.parameters.mode == "free_running" and not leap <= LED * late:
+            self.plant.say(f"a {LEAP} of {leap} V to {voltage.value} V was asked for")
+
     def _reset(self):
         super()._reset()
         self.plant = Witness(self.parameters)

@@ -146,10 +146,31 @@ def test_a_finger_that_leaves_its_fault_is_led_from_rest(neighbour, tmp_path):
         heard = next(commands.numbers)
         neighbour.wait(lambda: voltages[-1].number > heard + 20)
         assert voltages[-1].value == 3.0
+        # A reset on the way to rest stopped it at 5 V, where it waits for the first voltage that it takes again.
+        states.publish(FingerState(phase=FingerState.WAITING, voltage=5.0))
+        neighbour.wait(lambda: voltages[-1].value == 5.0)
         count = len(voltages)
-        states.publish(FingerState(phase=FingerState.WAITING, voltage=3.0))
+        states.publish(FingerState(phase=FingerState.RUNNING, voltage=5.0))
         neighbour.wait(lambda: voltages[-1].value > 10.0)
         assert np.abs(np.diff([v.value for v in voltages[count - 1 :]])).max() <= 0.1 + 1e-9
+
+
+def test_a_feedforward_that_stood_still_does_not_go_on(neighbour, tmp_path):
+    """Its commands never stayed away, but its finger has missed voltages for longer than `hold_time`."""
+    with node("feedforward", tmp_path, mode="free_running", hold_time=2.0) as processes:
+        voltages = neighbour.listen(Sample, "voltage")
+        words = diagnosed(neighbour, "feedforward")
+        Stream(neighbour, "command", 18e-6)
+        neighbour.wait(lambda: voltages and voltages[-1].value > 25.0)
+        process = processes.running["feedforward"]
+        process.send_signal(signal.SIGSTOP)
+        before = time.monotonic()
+        neighbour.wait(lambda: time.monotonic() - before > 3.0)
+        count = len(voltages)
+        process.send_signal(signal.SIGCONT)
+        neighbour.wait(lambda: voltages[-1].value == 0.0)
+        neighbour.wait(lambda: words() == "no command for 2 s")
+    assert np.diff([v.value for v in voltages[count - 1 :]]).max() <= 0.0
 
 
 @pytest.mark.shows("a value that is not finite or that no finger reaches")
@@ -486,6 +507,24 @@ def test_a_free_cantilever_latches_and_moves_with_the_wall_clock(neighbour, tmp_
     behind = [t - d.number * d.period for t, d in zip(stamps, deflections)]
     assert max(behind) - min(behind) < 0.3
     assert deflections[-1].number > len(deflections) + 50  # the halt is in the numbers
+
+
+def test_a_reset_on_the_way_to_rest_ends_it(neighbour, tmp_path):
+    parameters = {"mode": "free_running", "sample_time": 0.005, "ramp": 1.0}  # 20 s to rest
+    with node("cantilever", tmp_path, **parameters):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        stream = Stream(neighbour, "voltage", 20.0)
+        neighbour.wait(lambda: states and states[-1].voltage == 20.0)
+        stream.timer.cancel()
+        neighbour.wait(lambda: states[-1].phase == FingerState.RAMPING)
+        answer = reset(neighbour, "cantilever")
+        assert answer.success and "no voltage for 0.1 s" in answer.message
+        neighbour.wait(lambda: states[-1].phase == FingerState.WAITING)
+        stopped = states[-1].voltage
+        assert 0.0 < stopped < 20.0
+        stream.timer.reset()
+        neighbour.wait(lambda: states[-1].phase == FingerState.RUNNING)
+        neighbour.wait(lambda: states[-1].voltage == 20.0)
 
 
 def test_a_free_cantilever_does_not_act_upon_an_old_voltage(neighbour, tmp_path):

@@ -46,6 +46,8 @@ from piezo_control.sequence import grid_index
 from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import Dynamics, FingerState, Sample
 
+TAKES_NONE = (FingerState.WAITING, FingerState.RAMPING, FingerState.FAULT)  # phases of a finger
+
 
 class FeedforwardNode(BlockNode):
     NAME = "feedforward"
@@ -206,11 +208,16 @@ class FeedforwardNode(BlockNode):
         now = time.monotonic()
         is_free = p.mode == "free_running"
         share = min(1.0, (now - self.moved) / p.sample_time) if is_free else 1.0
+        if is_free:
+            # After standing still as a process: the finger is on its way to rest, and this voltage is not where it is.
+            self._look(now)
+            if self.guard.is_latched:
+                return False
         self.guard.hear(now)
         clipped = self.law.clipped
         finger = self.finger
-        if is_free and finger and finger.phase in (FingerState.RAMPING, FingerState.FAULT):
-            # It takes no voltage now, and leaps to the first one that it takes again unless that begins where it is.
+        if is_free and finger and finger.phase in TAKES_NONE:
+            # It leaps to the first voltage that it takes again unless that begins where it is.
             self.law.follow(finger.voltage)
             answer.value = self.law.voltage
             if isinstance(self.law, Sensorless):
@@ -289,8 +296,8 @@ class FeedforwardNode(BlockNode):
         self.answers.finish(DELIVERY_TIMEOUT)
         self.guard.reset()
 
-    def _watch(self) -> None:
-        now = time.monotonic()
+    def _look(self, now: float) -> None:
+        """See at `now` (s) whether commands have stayed away."""
         before = self.guard.phase
         self.guard.look(now, 2.0 * self.parameters.sample_time + RAMP_PERIOD, "command")
         if self.guard.phase != before and self.guard.is_latched:
@@ -298,6 +305,9 @@ class FeedforwardNode(BlockNode):
                 f"{self.guard.cause}: voltage goes to rest and stays there; {self.way_on()}"
             )
             self._tell()
+
+    def _watch(self) -> None:
+        self._look(time.monotonic())
         if self.guard.phase == RAMPING:
             self._ramp()
         elif self.guard.phase == FAULT and self.parameters.mode == "lockstep":

@@ -141,7 +141,7 @@ class CantileverNode(FingerNode):
 
     def reset(self) -> None:
         """Leave a fault: a new run in lock-step; running free, voltages count again."""
-        if self.phase != FingerState.FAULT:
+        if not self.guard.is_latched:
             return
         if self.parameters.mode == "lockstep":
             self.start()
