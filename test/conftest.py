@@ -7,6 +7,7 @@ import signal
 
 import own_domain
 import pytest
+from hypothesis import HealthCheck, settings
 
 CHROMIUM = shutil.which("chromium")
 FLAGS = (
@@ -24,6 +25,10 @@ for number in (signal.SIGINT, signal.SIGQUIT):
 
 # Small matrices only: threads of BLAS cost more than they save, above all on a busy machine.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# What is slow says nothing here: on a busy machine everything is.
+settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("busy")
 
 
 def pytest_configure(config):

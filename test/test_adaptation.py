@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from piezo_control import adaptation
@@ -41,7 +41,6 @@ def test_gain_and_offset_of_a_finger_that_moves_come_back():
     assert state.offset[0] == pytest.approx(OFFSET, abs=1e-10)
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-1e-3, 1e-3), st.floats(-1e-3, 1e-3)), max_size=50))
 def test_no_reading_leads_out_of_the_bounds(readings):
     a = adaptation.discretize(replace(ON, time_constant=1e-6), DENOMINATOR, H)

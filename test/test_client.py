@@ -364,7 +364,7 @@ def test_diagnostics_say_where_a_controller_comes_from(ros):
         (["-f", "bad name!", "state"], 2, "'bad name!' cannot be: namespace must not contain"),
         (["grip", "30", "--gripper", "1x"], 2, "'1x' cannot be: namespace must not have a token"),
         # The sensor's quantum is 10 nm.
-        (["set", "0.005", "--wait", "--near-um", "0.001"], 1, "µm, not at 0.005 µm: running"),
+        (["set", "0.005", "--wait", "--near-um", "0.001"], 1, "µm, not at 0.005 µm: "),
         (["control", "robst"], 1, "not one of the known"),
         (["wave", "sweep", "--amplitude-um", "1", "--frequency-hz", "1"], 2, "end_frequency is 0"),
         (["set", "1e6"], 1, "deflection is 1 m, must be within"),

@@ -17,7 +17,7 @@ import types
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("numba")  # `commission` and `udp_finger` import it
@@ -258,12 +258,7 @@ def test_any_words_end_in_an_exit_code(name, files):
     option = st.tuples(st.sampled_from(known), word)
     numbers = itertools.count()
 
-    @settings(
-        max_examples=60,
-        deadline=None,
-        database=None,
-        suppress_health_check=[HealthCheck.too_slow],
-    )
+    @settings(max_examples=60, database=None)
     @given(st.sampled_from(commands), st.lists(word, max_size=2), st.lists(option, max_size=3))
     def words_of_any_kind(command, positional, given_options):
         given_words = [*command, *positional, *itertools.chain(*given_options)]

@@ -47,7 +47,8 @@ def spoil(path, damage):
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=150,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(storage=st.booleans(), metadata=st.sampled_from(["kept", "gone", "spoilt"]), damage=damages)
 def test_no_damage_ends_in_another_error(whole, tmp_path_factory, storage, metadata, damage):
@@ -72,7 +73,6 @@ def test_no_damage_ends_in_another_error(whole, tmp_path_factory, storage, metad
 
 
 @given(data=st.binary(max_size=300), name=st.sampled_from(["a.mcap", "a.db3"]))
-@settings(deadline=None)
 def test_files_that_are_no_bags_are_refused(tmp_path_factory, data, name):
     path = tmp_path_factory.mktemp("none") / name
     path.write_bytes(data)

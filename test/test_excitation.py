@@ -19,7 +19,7 @@ def test_amplitudes_fall_linearly_to_zero():
 
 
 @given(st.lists(st.floats(-40.0, 40.0), max_size=30))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_sweep_homes_a_finger_whatever_its_past(past):
     """Full amplitude wipes the past out; what is left is half the last amplitude step."""
     actuator = Hysteresis(HysteresisParameters())

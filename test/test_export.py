@@ -180,7 +180,7 @@ def fingers(draw):
     return servo, feedback, feedforward
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4)
 @given(parameters=fingers())
 def test_any_finger_has_the_bits_of_the_law(parameters, tmp_path_factory):
     said = run_vectors(tmp_path_factory.mktemp("finger"), parameters)

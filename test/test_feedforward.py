@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
@@ -33,7 +33,6 @@ def test_sine_is_linearised_to_rounding():
 
 
 @given(commands, st.floats(5.0, 60.0), st.floats(1e4, 2e6))
-@settings(deadline=None)
 def test_exact_again_at_the_first_sample_without_a_limit(history, voltage_limit, slew_limit):
     parameters = FeedforwardParameters(
         voltage_low=-voltage_limit,

@@ -66,7 +66,6 @@ histories = st.lists(st.floats(-LIMIT, LIMIT), min_size=1, max_size=60)
 
 
 @given(hysteresis_parameters(), histories)
-@settings(deadline=None)
 def test_operator_is_the_weighted_sum_of_plays(parameters, history):
     plays = np.zeros(len(parameters.thresholds))
     thresholds = np.array(parameters.thresholds)
@@ -83,7 +82,7 @@ def test_operator_is_the_weighted_sum_of_plays(parameters, history):
     histories,
     histories,
 )
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 def test_operator_after_inverse_is_the_identity(parameters, past, history):
     """Modified, rate-dependent, single negative weights, states of a random past: to 1e-12."""
     actuator = Hysteresis(parameters, sample_time=SAMPLE_TIME)
@@ -102,7 +101,6 @@ def test_operator_after_inverse_is_the_identity(parameters, past, history):
 
 
 @given(hysteresis_parameters(dead_zones(), st.floats(0.0, 0.9)), histories, histories)
-@settings(deadline=None)
 def test_inverse_follows_voltages_of_others(parameters, applied, history):
     """After voltages that were not the inverse's own, it is exact at the next sample."""
     actuator = Hysteresis(parameters, sample_time=SAMPLE_TIME)
@@ -124,7 +122,6 @@ def test_inverse_started_from_zero_after_a_history_is_wrong_by_volts():
 
 
 @given(hysteresis_parameters(), st.floats(0.0, 1.0), st.floats(0.0, LIMIT))
-@settings(deadline=None)
 def test_a_virgin_share_bends_the_first_rise_and_the_first_fall_alike(parameters, share, voltage):
     """By the joins: a part 1 - v at r, and v/2 each at 0 and at 2 r."""
     r, w = np.array(parameters.thresholds), np.array(parameters.weights)
@@ -144,7 +141,6 @@ def test_a_virgin_share_that_is_no_part_is_refused(share):
 
 
 @given(hysteresis_parameters(), st.floats(0.0, 1.0), histories)
-@settings(deadline=None)
 def test_of_a_virgin_share_nothing_is_left_once_the_voltage_has_been_to_both_ends(
     parameters, share, history
 ):

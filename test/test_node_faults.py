@@ -617,7 +617,11 @@ def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing
     node.trigger_configure()
     node.trigger_activate()
     states, commands, _ = node.faces
+    finger = node.fingers[0]
+    finger._take(FingerState(phase=FingerState.RUNNING))
+    finger.follow(hold(1e-6))
     node.trigger_deactivate()
+    finger._take(FingerState(phase=FingerState.IDLE))
     states._publish()
     commands._on_command(JointState(name=["gripper_joint"], position=[3e-5]))
     commands._on_trajectory(JointTrajectory(joint_names=["gripper_joint"]))

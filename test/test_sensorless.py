@@ -38,7 +38,6 @@ STEP = Profile([0.0, 0.1], [0.0, 20e-6])
 WARMING = TemperatureParameters(profile="ramp", start=1.0, duration=20.0, amplitude_degc=10.0)
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=8),
     st.floats(-40.0, 40.0),
@@ -55,7 +54,6 @@ def test_operator_inverse_solves_its_equation(past, voltage, scale, line):
     assert found == pytest.approx(voltage, abs=1e-11)
 
 
-@settings(deadline=None)
 @given(
     st.floats(0.0, 1.0),
     st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=20),
@@ -232,7 +230,7 @@ def test_so_do_those_that_begin_downward_and_smaller_ones(truth, amplitude, degc
     assert np.max(np.abs(run.true_deflection - wanted.at(run.time))) <= 0.02 * study.STROKE
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(st.tuples(st.floats(-25e-6, 25e-6), st.floats(10.0, 45.0)), max_size=40))
 def test_it_is_exact_again_after_limits_and_any_temperature(history):
     """The models follow the voltage that was applied, so the prediction is the plant's static deflection."""

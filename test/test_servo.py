@@ -290,7 +290,7 @@ def test_a_share_of_late_periods_is_judged_over_five_windows(running):
     assert running.cause == "25.0% of the periods are late or missed, must be at most 20.0%"
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.floats(0.0, 1.0), min_size=20, max_size=60), st.integers(0, 2**32 - 1))
 def test_limits_hold_in_time_whatever_the_reference_and_the_sensor_do(shares, seed):
     random = np.random.default_rng(seed)

@@ -112,7 +112,7 @@ def write(path, shape):
     return exact, {q: f"{q if named else order.index(q)}:{units[q]}" for q in units}
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(shapes())
 def test_a_measurement_comes_back_from_any_shape(tmp_path_factory, shape):
     path = tmp_path_factory.mktemp("table") / "measured.txt"
@@ -155,7 +155,7 @@ DAMAGES = {
 }
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.sampled_from(list(DAMAGES)), st.integers(2, 50), st.sampled_from(",;\t|"))
 def test_a_damaged_one_is_refused(tmp_path_factory, damage, k, separator):
     rows = [["time", "voltage", "deflection_um"]]
@@ -495,7 +495,6 @@ def test_a_row_of_words_for_no_number_has_no_names(tmp_path):
 
 
 @given(st.binary(max_size=400))
-@settings(deadline=None)
 def test_rubbish_is_refused_in_words(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("rubbish") / "a.csv"
     path.write_bytes(data)

@@ -24,7 +24,7 @@ def values(count=20000, first=0, **changes):
 @given(
     st.sampled_from(PROFILES[:-1]), st.integers(0, 30000), st.integers(0, 5000), st.floats(0.0, 5.0)
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_value_does_not_depend_on_what_else_is_asked_for(profile, first, count, start):
     changes = {"profile": profile, "start": start}
     whole = values(first + count, **changes)

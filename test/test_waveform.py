@@ -43,7 +43,7 @@ def test_decaying_sine_falls_linearly_after_its_first_cycle():
     np.testing.assert_allclose(quarters, [40.0, 37.5, 27.5, 17.5, 7.5], rtol=1e-12)
 
 
-QUICK = settings(deadline=None, max_examples=30)
+QUICK = settings(max_examples=30)
 START = st.just(0.0)
 
 

@@ -269,6 +269,8 @@ class Finger:
         self._felt = push.number
 
     def _take(self, state: FingerState) -> None:
+        if self not in self._node.fingers:
+            return  # it was on its way when the gripper was stopped
         restarted = self.state is not None and state.samples < self.state.samples
         self.state = state
         self.heard = monotonic()
