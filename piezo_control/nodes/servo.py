@@ -92,6 +92,7 @@ class ServoNode(FingerNode):
         self._entered = time.monotonic()
         self._last: Samples | None = None
         self._voltage, self._left = 0.0, ""  # of the loop before: V, and why that is not at rest
+        self._rested = "", "", math.nan  # driver, its options, and what its card puts out at rest
         self._held = 0  # samples whose command was at an end of its range
         self._told = 0.0
         self._errors: list[tuple[float, float]] = []
@@ -156,13 +157,16 @@ class ServoNode(FingerNode):
         if p.force_control:
             check_force(p, feedforward, controller.sample_time)
             feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
+        *card, stands_at = self._rested
+        if card != [p.driver, p.driver_options]:
+            stands_at = math.nan
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
         try:
             self.servo = Servo(
-                driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling
+                driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling, stands_at
             )
         except (ParameterError, DriverError) as error:
             driver.close()
@@ -184,6 +188,8 @@ class ServoNode(FingerNode):
         self._say_origins()
         self.get_logger().info("the loop is compiled, if it was not before: half a minute or so")
         self.servo.start()
+        # There the loop leaves it, or the hardware, which goes to rest by itself when voltages stop coming.
+        self._rested = p.driver, p.driver_options, self.servo.rest_output
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()
         self.teller.timer_period_ns = round(p.state_period * 1e9)
@@ -201,7 +207,7 @@ class ServoNode(FingerNode):
                 f"the driver does not say what the card puts out: it has to be at rest, {rest:g} V"
             )
         elif voltage != rest:
-            self.get_logger().info(f"the card puts out {voltage:g} V: led to rest, {rest:g} V")
+            self.get_logger().info(f"the finger is at {voltage:g} V: led to rest, {rest:g} V")
 
     def _say_origins(self) -> None:
         p = self.parameters
