@@ -46,6 +46,7 @@ from piezo_control.servo.driver import (
 )
 from piezo_control.servo.law import judge_write, laws_of, servo_step, settings_of, watch_at_rest
 from piezo_control.servo.loop import Samples, Servo
+from piezo_control.servo.parameters import ServoParameters
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import CantileverParameters
@@ -479,7 +480,8 @@ def test_commission_asks_before_anything_moves(monkeypatch, says, told):
     card, asked = Card(12.0, says), []
     bench = bench_on(card, monkeypatch, voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     assert commission.commission(bench, None, asked.append) is None
-    assert asked == [f"to rest at 75 V ({told})?"]
+    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest"
+    assert asked == [f"within {span}; to rest at 75 V ({told})?"]
     assert card.closed and not len(card.voltages)
 
 
@@ -546,6 +548,34 @@ def node(monkeypatch):
         listener.destroy_node()
         node.destroy_node()
         rclpy.shutdown()
+
+
+def test_what_the_card_is_going_to_put_out_is_said_in_its_unit():
+    stack = VoltageParameters(voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
+    millivolts = ServoParameters(amplifier_gain=0.05, amplifier_zero=2048.0)
+    assert millivolts.span(stack) == (
+        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest"
+    )
+
+
+def test_limits_that_nobody_gave_are_warned_of(node, capfd):
+    node.set_parameters([rclpy.parameter.Parameter("driver", value="board")])
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    said = capfd.readouterr().err
+    assert "the finger gets -40 to 40 V, 0 V at rest; the card puts out -40 to 40" in said
+    assert "what yours stands belongs into a 'feedforward_file'" in said
+
+
+def test_no_state_tells_a_fault_that_was_reset(node):
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node.servo.give_up_without_temperature()
+    node.until(lambda state: state.phase == FingerState.FAULT)
+    node.servo.reset()
+    wait(lambda: node.servo.phase == NORMAL)
+    heard = len(node.heard)
+    node._tell()
+    node.until(lambda _: len(node.heard) > heard)
+    assert {state.phase for state in node.heard[heard:]} == {FingerState.RUNNING}
 
 
 @pytest.mark.parametrize("error", [ValueError, RuntimeError])

@@ -47,6 +47,7 @@ from piezo_control.safety import (
     LARGEST_DEFLECTION,
     NORMAL,
     RAMPING,
+    VoltageParameters,
 )
 from piezo_control.servo.clock import lateness_quantile
 from piezo_control.servo.driver import DriverError, open_driver
@@ -87,7 +88,7 @@ class ServoNode(FingerNode):
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
         )
-        self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
+        self.teller = self.create_steady_timer(self.parameters.state_period, self._tell)
         self.phase = FingerState.IDLE
         self._entered = time.monotonic()
         self._last: Samples | None = None
@@ -171,6 +172,7 @@ class ServoNode(FingerNode):
         except (ParameterError, DriverError) as error:
             driver.close()
             raise ValueError(str(error)) from None
+        self._say_limits(feedforward)
         self._say_where_it_begins(self.servo.begins_at, feedforward.rest)
         if p.force_control:
             self.thermometer = Thermometer(p.thermometer, time.monotonic())
@@ -189,7 +191,7 @@ class ServoNode(FingerNode):
         self.get_logger().info("the loop is compiled, if it was not before: half a minute or so")
         self.servo.start()
         # There the loop leaves it, or the hardware, which goes to rest by itself when voltages stop coming.
-        self._rested = p.driver, p.driver_options, self.servo.rest_output
+        self._rested = p.driver, p.driver_options, p.output(feedforward.rest)
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()
         self.teller.timer_period_ns = round(p.state_period * 1e9)
@@ -200,6 +202,17 @@ class ServoNode(FingerNode):
             f"loop at {1.0 / controller.sample_time:g} Hz on driver '{p.driver}' with {law}"
         )
         self._follow_phase()
+
+    def _say_limits(self, voltage: VoltageParameters) -> None:
+        """Say what the card is going to put out, which nobody but people can compare with a data sheet."""
+        p = self.parameters
+        words = f"the finger gets {p.span(voltage)}"
+        if p.driver == "simulated" or p.feedforward_file:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(
+                f"{words}, the limits of the paper's finger: what yours stands belongs into a 'feedforward_file'"
+            )
 
     def _say_where_it_begins(self, voltage: float, rest: float) -> None:
         if math.isnan(voltage):
@@ -395,6 +408,11 @@ class ServoNode(FingerNode):
                 f"{s.cause}; voltage goes to rest and stays there; {self.way_on()}"
             )
             self.publish_diagnostics()
+        self._publish_state()
+
+    def _tell(self) -> None:
+        if self.active and self.servo:
+            self._follow_phase()  # the text is of the phase that is told with it
         self._publish_state()
 
     def _publish_state(self) -> None:

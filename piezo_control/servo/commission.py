@@ -271,7 +271,7 @@ def commission(
     says = (
         "the driver does not say what the card puts out" if math.isnan(now) else f"from {now:.3g} V"
     )
-    if not agree(f"to rest at {home:.3g} V ({says})?"):
+    if not agree(f"within {bench.card.span(bench.limits)}; to rest at {home:.3g} V ({says})?"):
         return None
     rest = at_rest(bench)
     bench.zero = rest.mean / bench.scale

@@ -514,11 +514,6 @@ class Servo:
         return self._loop.settings.voltage.rest
 
     @property
-    def rest_output(self) -> float:
-        """What the card puts out for that, in its unit."""
-        return self._loop.amplifier_zero + self.rest / self._loop.amplifier_gain
-
-    @property
     def clipped(self) -> int:
         """Number of samples at which the voltage or slew limit acted."""
         return int(self._loop.laws.feedforward_state.clipped[0])
