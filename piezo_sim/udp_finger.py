@@ -3,6 +3,7 @@
 
 Every datagram brings a voltage, which is held from then on, and is answered with the deflection measured just
 before. Without a voltage for the hold time the finger ramps itself to rest, as the hardware of a real one must.
+Whoever asks hears what voltage is on.
 Whoever sends the first one leads the finger until it lets go or is silent for the hold time, and its numbers rise;
 others are named, told so and not acted upon.
 When it is stopped it says, and with --report writes, what voltages it saw.
@@ -34,7 +35,7 @@ from piezo_sim.driver import Device, device_of, read, write
 from piezo_sim.plant.cantilever import CantileverParameters
 
 PORT = 9750
-WORD = struct.unpack("<q", b"PZG1\0\0\0\0")[0]
+WORD, ASKS = struct.unpack("<qq", b"PZG1\0\0\0\0PZG?\0\0\0\0")
 SIZE = 24  # bytes of a datagram: word, number, value
 
 _recvfrom: Any = types.ExternalFunction(
@@ -91,7 +92,7 @@ def serve(
     line: Line, device: Device, clock: Clock, seen: Seen, hold: int, step: float, stop: np.ndarray
 ) -> None:
     """Answer datagrams until `stop`; after `hold` ns without one go `step` (V) per ramp period to rest."""
-    heard = now(clock)
+    heard = ramped = now(clock)
     rest = device.plant.amplifier.rest
     while stop[0] == 0:
         line.length[0] = 128
@@ -121,7 +122,7 @@ def serve(
                 continue
             if seen.samples[0] > 0.0:
                 seen.lost[0] += number - seen.number[0] - 1
-                seen.step[0] = max(seen.step[0], abs(voltage - device.demand[0]))
+            seen.step[0] = max(seen.step[0], abs(voltage - device.demand[0]))
             heard = instant
             seen.number[0] = number
             seen.samples[0] += 1.0
@@ -129,14 +130,19 @@ def serve(
             seen.highest[0] = max(seen.highest[0], voltage)
             line.floats[2] = line.zero + line.scale * device.reading[0]
             answer(line)
-        elif instant - heard > hold and device.demand[0] != rest:
+            write(device, voltage, instant)
+            continue
+        if size == SIZE and line.integers[0] == ASKS:
+            line.floats[2] = device.demand[0]
+            answer(line)
+        # In time, however often somebody asks meanwhile.
+        share = min(1.0, (instant - ramped) * 1e-9 / RAMP_PERIOD)
+        ramped = instant
+        if instant - heard > hold and device.demand[0] != rest:
             if heard > 0:
                 seen.ramps[0] += 1.0
                 heard = 0  # counted
-            voltage = toward(rest, step, device.demand[0])
-        else:
-            continue
-        write(device, voltage, instant)
+            write(device, toward(rest, step * share, device.demand[0]), instant)
 
 
 def answer(line: Line) -> None:

@@ -304,15 +304,20 @@ def test_an_impossible_transition_is_answered_with_no(neighbour, tmp_path):
             "comes every 0.001 s, must come at the sample time of 'feedback': 0.0001 s",
         ),
         ({"stamped": True}, "is sent in mode 'free_running', 'feedback' is in mode 'lockstep'"),
+        # As of a finger that has been running free for a while.
+        (
+            {"stamped": True, "number": 1515},
+            "is sent in mode 'free_running', 'feedback' is in mode 'lockstep'",
+        ),
     ],
-    ids=["sample time", "mode"],
+    ids=["sample time", "mode", "mode, long since"],
 )
 def test_samples_of_another_loop_are_refused_by_name(neighbour, tmp_path, fields, words):
     with node("feedback", tmp_path, "feedback_robust.yaml"):
         commands = neighbour.listen(Sample, "command")
         said = diagnosed(neighbour, "feedback")
         deflection = neighbour.publisher("deflection")
-        first = sample(0, 0.0)
+        first = sample(fields.get("number", 0), 0.0)
         first.period = fields.get("period", 0.0)
         if "stamped" in fields:
             first.header.stamp.sec = int(time.time())

@@ -8,6 +8,7 @@ import re
 import resource
 import signal
 import subprocess
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -781,3 +782,24 @@ def test_a_temperature_log_that_cannot_be_replayed_is_refused_and_ends_nothing(n
         neighbour.wait(lambda: "deactivates: " in (tmp_path / "temperature.log").read_text())
         assert not neighbour.change_state("temperature", Transition.TRANSITION_ACTIVATE)
         processes.check()
+
+
+FIRST_LINE = """
+import inspect
+import rclpy
+import piezo_sim.nodes.cantilever
+from piezo_control.nodes import spin
+spin.init([])
+known = len(inspect.modulesbyfile)
+rclpy.create_node("finger").get_logger().info("running")
+print(known, len(inspect.modulesbyfile))
+"""
+
+
+def test_the_first_line_of_a_log_looks_through_no_modules():
+    """That takes 0.1 s, so a cantilever that ran free stood still for its hold time as it said "running"."""
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST_LINE], capture_output=True, text=True, timeout=TIMEOUT, check=True
+    )  # fmt: skip
+    before, after = map(int, done.stdout.split())
+    assert 500 < before and after < before + 50

@@ -660,6 +660,7 @@ def test_from_an_unknown_finger_to_a_loop_that_survives_its_death(stand):
     assert servo["frozen_voltage"] == pytest.approx(4.0)
     stand.start_servo(found)
     stand.wait(lambda: stand.phase == FingerState.RUNNING)
+    assert "the finger gets -40 to 40 V, 10 V at rest" in stand.log("servo")
     stand.reference.publish(Sample(value=20e-6))
     stand.wait(lambda: stand.is_at(20e-6))
     stand.wait(lambda: stand.states[-1].on_target)

@@ -2,10 +2,12 @@
 """The servo on cards that refuse, hang, die, take their time or were elsewhere, and on fingers with two masters."""
 
 import argparse
+import ctypes
 import math
 import socket
 import struct
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -21,6 +23,7 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes import servo as servo_node
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.nodes.servo import ServoNode
+from piezo_control.parameters import dump
 from piezo_control.profile import Profile
 from piezo_control.safety import (
     FAULT,
@@ -39,10 +42,13 @@ from piezo_control.servo.driver import (
     DriverError,
     SharedLibrary,
     applied,
+    library,
 )
 from piezo_control.servo.law import judge_write, laws_of, servo_step, settings_of, watch_at_rest
 from piezo_control.servo.loop import Samples, Servo
+from piezo_control.servo.parameters import ServoParameters
 from piezo_gripper_msgs.msg import FingerState
+from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.cantilever import CantileverParameters
 from piezo_sim.udp_finger import UdpFinger
 
@@ -63,6 +69,7 @@ class Board(NamedTuple):
     answer: np.ndarray  # what `write` returns; only where it is FRESH the output moves
     takes: np.ndarray  # ns that every other write takes before the output moves
     hangs: np.ndarray  # 1: `read` does not come back
+    silent: np.ndarray  # so many times `read` has no reading
     count: np.ndarray
     outputs: np.ndarray
     instants: np.ndarray  # ns
@@ -72,6 +79,9 @@ class Board(NamedTuple):
 def read(board, _):
     while board.hangs[0] != 0:
         now(board.clock)
+    if board.silent[0] > 0:
+        board.silent[0] -= 1
+        return NONE_IN_TIME
     board.reading[0] = GAIN * board.output[0] + 1e-12 * (board.count[0] % 2)
     return FRESH
 
@@ -93,7 +103,7 @@ class Card:
     """Driver of a board that puts out `output`, and says so where `says`."""
 
     def __init__(self, output=0.0, says=True):
-        whole = [np.zeros(1, dtype=np.int64) for _ in range(4)]
+        whole = [np.zeros(1, dtype=np.int64) for _ in range(5)]
         self.device = Board(
             clock_of(SLOW, 0.0), np.full(1, output), *whole, np.zeros(TAKEN),
             np.zeros(TAKEN, dtype=np.int64), np.zeros(2),
@@ -281,10 +291,59 @@ def test_a_card_that_does_not_say_where_it_is_has_to_be_at_rest():
     card = Card(says=False)
     assert math.isnan(applied(card, 1.0, 0.0))
     assert servo_on(card, stack).voltage == 75.0
-    # A library that lacks the optional function of piezo_driver.h.
-    udp = SharedLibrary("udp", "127.0.0.1:9", SLOW)
-    assert math.isnan(applied(udp, 1.0, 0.0))
-    udp.close()
+    assert applied(card, 2.0, 10.0, otherwise=40.0) == 60.0
+
+
+def test_a_finger_says_what_it_puts_out_until_it_rests():
+    plant = CantileverParameters(amplifier=AmplifierParameters(rest_voltage=5.0))
+    finger = UdpFinger(plant, safety=SafetyParameters(hold_time=2.0))
+    udp = SharedLibrary("udp", f"127.0.0.1:{finger.port}", SLOW)
+    assert math.isnan(applied(udp, 1.0, 0.0))  # nobody answers yet, or does not know the question
+    finger.start()
+    card = ctypes.CDLL(str(library("udp")))
+    try:
+        assert applied(udp, 2.0, -1.0) == 12.0
+        card.piezo_write(ctypes.c_void_p(udp.device.device), ctypes.c_double(30.0))
+        wait(lambda: applied(udp, 1.0, 0.0) == 30.0)
+        wait(lambda: applied(udp, 1.0, 0.0) == 5.0)  # asking keeps no finger from its rest
+    finally:
+        udp.close()
+        report = finger.stop()
+    assert (report.own_ramps, report.samples, report.refused_datagrams) == (1, 1, 0)
+
+
+def test_a_servo_of_another_rest_than_the_finger_leads_it_there():
+    finger = UdpFinger(CantileverParameters())
+    finger.start()
+    driver = SharedLibrary("udp", f"127.0.0.1:{finger.port}", SLOW)
+    stack = replace(STRAIGHT, rest_voltage=30.0)
+    servo = servo_on(driver, stack)
+    try:
+        servo.start()
+        wait(lambda: servo.phase == NORMAL)
+    finally:
+        left = servo.stop()
+        report = finger.stop()
+    assert left == "" and report.highest_voltage == 30.0
+    if not report.lost_datagrams:
+        assert report.largest_step <= 1.0 + 1e-9  # 1e3 V/s, 1 ms; it was 30 V
+
+
+def test_a_loop_that_stood_still_goes_on_from_where_the_card_went_meanwhile(at_20_volts):
+    """To rest by itself, as hardware has to; it leaped back to 20 V."""
+    servo, card = at_20_volts
+    card.device.hangs[0] = 1
+    asked = time.monotonic()
+    wait(lambda: time.monotonic() > asked + 2.0 * servo.parameters.hold_time)
+    before = int(card.device.count[0])
+    card.device.output[0] = 0.0
+    card.device.hangs[0] = 0
+    wait(
+        lambda: card.device.output[0] == pytest.approx(20.0)
+    )  # missed periods are no fault of this servo
+    assert abs(card.voltages[before]) <= 1.0 + 1e-9  # 1e3 V/s, 1 ms
+    assert np.abs(np.diff(card.voltages[before:])).max() <= 1.0 + 1e-9
+    assert servo.missed >= 199
 
 
 @pytest.mark.parametrize("said", [math.inf, 1001.0])
@@ -425,7 +484,8 @@ def test_commission_asks_before_anything_moves(monkeypatch, says, told):
     card, asked = Card(12.0, says), []
     bench = bench_on(card, monkeypatch, voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     assert commission.commission(bench, None, asked.append) is None
-    assert asked == [f"to rest at 75 V ({told})?"]
+    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest"
+    assert asked == [f"within {span}; to rest at 75 V ({told})?"]
     assert card.closed and not len(card.voltages)
 
 
@@ -437,6 +497,17 @@ def test_commission_measures_at_rest_and_leads_there_slowly(monkeypatch):
     assert rest.mean == pytest.approx(75.0 * GAIN)
     assert rest.noise < 1e-11
     card.assert_slew(limit=100.0)
+
+
+def test_commission_tries_again_where_a_busy_machine_gave_no_reading(monkeypatch):
+    card = Card()
+    bench = bench_on(card, monkeypatch)
+    card.device.silent[0] = 150  # 0.15 s, the hold time being 0.1 s
+    assert commission.at_rest(bench).noise < 1e-11
+    card.device.silent[0] = 10**6  # one that is unplugged
+    with pytest.raises(commission.NoAnswer, match="no reading of the sensor for 0.1 s"):
+        commission.at_rest(bench)
+    assert card.device.output[0] == 0.0
 
 
 def test_commission_says_what_was_not_left_at_rest(monkeypatch):
@@ -494,6 +565,34 @@ def node(monkeypatch):
         rclpy.shutdown()
 
 
+def test_what_the_card_is_going_to_put_out_is_said_in_its_unit():
+    stack = VoltageParameters(voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
+    millivolts = ServoParameters(amplifier_gain=0.05, amplifier_zero=2048.0)
+    assert millivolts.span(stack) == (
+        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest"
+    )
+
+
+def test_limits_that_nobody_gave_are_warned_of(node, capfd):
+    node.set_parameters([rclpy.parameter.Parameter("driver", value="board")])
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    said = capfd.readouterr().err
+    assert "the finger gets -40 to 40 V, 0 V at rest; the card puts out -40 to 40" in said
+    assert "what yours stands belongs into a 'feedforward_file'" in said
+
+
+def test_no_state_tells_a_fault_that_was_reset(node):
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node.servo.give_up_without_temperature()
+    node.until(lambda state: state.phase == FingerState.FAULT)
+    node.servo.reset()
+    wait(lambda: node.servo.phase == NORMAL)
+    heard = len(node.heard)
+    node._tell()
+    node.until(lambda _: len(node.heard) > heard)
+    assert {state.phase for state in node.heard[heard:]} == {FingerState.RUNNING}
+
+
 @pytest.mark.parametrize("error", [ValueError, RuntimeError])
 def test_an_activation_that_fails_leaves_no_loop_and_no_open_card(node, monkeypatch, error):
     def fail(*_):
@@ -530,6 +629,43 @@ def test_a_loop_that_does_not_go_on_is_said_and_keeps_its_card_alone(node):
     node.until(lambda state: state.phase == FingerState.IDLE and not state.text)
     assert node.card.closed and node.card.device.output[0] == 0.0
     assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+
+
+@pytest.mark.parametrize(
+    "change, begins, rests",
+    [({"rest": 20.0}, 10.0, 20.0), ({"amplifier_gain": -1.0}, -10.0, -10.0), ({"amplifier_zero": 5.0}, 5.0, 15.0)],
+)  # fmt: skip
+def test_what_changes_between_two_loops_is_no_leap_at_a_card_that_does_not_say(
+    node, tmp_path, change, begins, rests
+):
+    """The card is where the loop before has left it, whatever that is called now; it leaped by up to 20 V."""
+
+    def use(rest=10.0, **parameters):
+        limits = {"rest_voltage": rest, "slew_limit": STRAIGHT.slew_limit}
+        dump(tmp_path / f"{rest}.yaml", "feedforward", limits)
+        parameters["feedforward_file"] = str(tmp_path / f"{rest}.yaml")
+        answers = node.set_parameters(
+            [rclpy.parameter.Parameter(name, value=value) for name, value in parameters.items()]
+        )
+        assert all(answer.successful for answer in answers)
+
+    def run():
+        assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        begin = node.servo.begins_at
+        node.until(lambda state: state.phase == FingerState.RUNNING)
+        node.trigger_deactivate()
+        return begin
+
+    node.card = Card(10.0, says=False)
+    use()
+    assert math.isnan(run())
+    use(**change)
+    assert run() == begins
+    assert np.abs(np.diff(node.card.voltages)).max() <= 1.0 + 1e-9  # 1e3 V/s, 1 ms
+    assert node.card.device.output[0] == pytest.approx(rests)
+    # Nobody knows where another card is.
+    use(driver_options="another")
+    assert math.isnan(run())
 
 
 def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):

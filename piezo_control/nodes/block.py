@@ -196,6 +196,10 @@ class BlockNode(FingerNode):
         self._waiting = None
         if not self.active or self.guard.is_latched:
             return
+        # Before its number is looked at: another loop counts otherwise, and a stray number is only said.
+        if wrong := wrong_time(sample, self.INPUT, self.parameters, self.NAME):
+            self.trip(wrong + self._input.others())
+            return
         number = sample.number
         lockstep = self.parameters.mode == "lockstep"
         kind = self.sequence.classify(number)
@@ -225,9 +229,6 @@ class BlockNode(FingerNode):
                     f"{readers} are there"
                 )
                 return  # the cantilever asks again
-        if wrong := wrong_time(sample, self.INPUT, self.parameters, self.NAME):
-            self.trip(wrong + self._input.others())
-            return
         if not is_physical(sample.value, self.LARGEST):
             self.get_logger().error(
                 f"'{self.INPUT}' sample {number} is {sample.value}, must be finite and within "

@@ -47,6 +47,7 @@ from piezo_control.safety import (
     LARGEST_DEFLECTION,
     NORMAL,
     RAMPING,
+    VoltageParameters,
 )
 from piezo_control.servo.clock import lateness_quantile
 from piezo_control.servo.driver import DriverError, open_driver
@@ -87,11 +88,12 @@ class ServoNode(FingerNode):
         self.drain = self.create_steady_timer(
             self.parameters.block_period, self._drain, autostart=False
         )
-        self.teller = self.create_steady_timer(self.parameters.state_period, self._publish_state)
+        self.teller = self.create_steady_timer(self.parameters.state_period, self._tell)
         self.phase = FingerState.IDLE
         self._entered = time.monotonic()
         self._last: Samples | None = None
         self._voltage, self._left = 0.0, ""  # of the loop before: V, and why that is not at rest
+        self._rested = "", "", math.nan  # driver, its options, and what its card puts out at rest
         self._held = 0  # samples whose command was at an end of its range
         self._told = 0.0
         self._errors: list[tuple[float, float]] = []
@@ -156,17 +158,21 @@ class ServoNode(FingerNode):
         if p.force_control:
             check_force(p, feedforward, controller.sample_time)
             feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
+        *card, stands_at = self._rested
+        if card != [p.driver, p.driver_options]:
+            stands_at = math.nan
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
         try:
             self.servo = Servo(
-                driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling
+                driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling, stands_at
             )
         except (ParameterError, DriverError) as error:
             driver.close()
             raise ValueError(str(error)) from None
+        self._say_limits(feedforward)
         self._say_where_it_begins(self.servo.begins_at, feedforward.rest)
         if p.force_control:
             self.thermometer = Thermometer(p.thermometer, time.monotonic())
@@ -184,6 +190,8 @@ class ServoNode(FingerNode):
         self._say_origins()
         self.get_logger().info("the loop is compiled, if it was not before: half a minute or so")
         self.servo.start()
+        # There the loop leaves it, or the hardware, which goes to rest by itself when voltages stop coming.
+        self._rested = p.driver, p.driver_options, p.output(feedforward.rest)
         # Sample 0 on the clock on the wall; the monotonic clock does not follow its corrections.
         self._to_wall = time.time() - time.monotonic()
         self.teller.timer_period_ns = round(p.state_period * 1e9)
@@ -195,13 +203,24 @@ class ServoNode(FingerNode):
         )
         self._follow_phase()
 
+    def _say_limits(self, voltage: VoltageParameters) -> None:
+        """Say what the card is going to put out, which nobody but people can compare with a data sheet."""
+        p = self.parameters
+        words = f"the finger gets {p.span(voltage)}"
+        if p.driver == "simulated" or p.feedforward_file:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(
+                f"{words}, the limits of the paper's finger: what yours stands belongs into a 'feedforward_file'"
+            )
+
     def _say_where_it_begins(self, voltage: float, rest: float) -> None:
         if math.isnan(voltage):
             self.get_logger().info(
                 f"the driver does not say what the card puts out: it has to be at rest, {rest:g} V"
             )
         elif voltage != rest:
-            self.get_logger().info(f"the card puts out {voltage:g} V: led to rest, {rest:g} V")
+            self.get_logger().info(f"the finger is at {voltage:g} V: led to rest, {rest:g} V")
 
     def _say_origins(self) -> None:
         p = self.parameters
@@ -389,6 +408,11 @@ class ServoNode(FingerNode):
                 f"{s.cause}; voltage goes to rest and stays there; {self.way_on()}"
             )
             self.publish_diagnostics()
+        self._publish_state()
+
+    def _tell(self) -> None:
+        if self.active and self.servo:
+            self._follow_phase()  # the text is of the phase that is told with it
         self._publish_state()
 
     def _publish_state(self) -> None:

@@ -53,7 +53,7 @@ from piezo_control.parameters import ParameterError, build, dump, flatten  # noq
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
 from piezo_control.servo.driver import Driver, DriverError, applied, open_driver  # noqa: E402
-from piezo_control.servo.law import SENSOR_OLD  # noqa: E402
+from piezo_control.servo.law import SENSOR_OLD, SENSOR_SILENT  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
 from piezo_control.servo.parameters import ServoParameters  # noqa: E402
 from piezo_control.shared import shared_folder  # noqa: E402
@@ -79,7 +79,7 @@ class NoAnswer(RuntimeError):
 
 
 class LateReadings(NoAnswer):
-    """Readings that were too old."""
+    """Readings that were too old, or stayed away for the hold time."""
 
 
 @dataclass
@@ -146,7 +146,8 @@ class Bench:
 
         def go_on() -> Samples:
             if wrong := servo.cause or servo.stuck:
-                raise (LateReadings if servo.cause_code == SENSOR_OLD else NoAnswer)(wrong)
+                is_late = servo.cause_code in (SENSOR_OLD, SENSOR_SILENT)
+                raise (LateReadings if is_late else NoAnswer)(wrong)
             time.sleep(0.02)
             servo.look_ahead()
             return servo.samples()
@@ -271,7 +272,7 @@ def commission(
     says = (
         "the driver does not say what the card puts out" if math.isnan(now) else f"from {now:.3g} V"
     )
-    if not agree(f"to rest at {home:.3g} V ({says})?"):
+    if not agree(f"within {bench.card.span(bench.limits)}; to rest at {home:.3g} V ({says})?"):
         return None
     rest = at_rest(bench)
     bench.zero = rest.mean / bench.scale

@@ -121,12 +121,14 @@ def open_driver(name: str, options: str, sample_time: float) -> Driver:
     return SharedLibrary(name, options, sample_time)
 
 
-def applied(driver: Driver, gain: float, zero: float) -> float:
-    """Return what the card of a driver that was just opened puts out (V); NaN: the driver does not say.
+def applied(driver: Driver, gain: float, zero: float, otherwise: float = math.nan) -> float:
+    """Return what the card of an open driver puts out (V); NaN: nobody says.
 
-    `gain` (V) and `zero` are the amplifier's. Raises DriverError for a voltage that no card can mean.
+    `gain` (V) and `zero` are the amplifier's, `otherwise` what a card that does not say is known to put out, in its
+    unit. Raises DriverError for a voltage that no card can mean.
     """
     said = getattr(driver, "applied", lambda: math.nan)()
+    said = otherwise if math.isnan(said) else said
     voltage = gain * (said - zero)
     if not math.isnan(said) and not is_physical(voltage, LARGEST_VOLTAGE):
         raise DriverError(

@@ -28,7 +28,7 @@ from piezo_control.safety import FAULT, NORMAL, RAMPING
 from piezo_control.servo.card import read_card as read
 from piezo_control.servo.card import write_card as write
 from piezo_control.servo.clock import Clock, become_real_time, begin, clock_of, now, wait_for_edge
-from piezo_control.servo.driver import FRESH, Driver, applied
+from piezo_control.servo.driver import FRESH, Driver, DriverError, applied
 from piezo_control.servo.law import (
     CAUSES,
     DEVICE,
@@ -111,16 +111,22 @@ class Loop(NamedTuple):
     at_next_edge: bool
 
 
-def run(loop: Loop, device: Any) -> None:
+def run(loop: Loop, device: Any) -> bool:
     """Run the loop on a device until it is asked to stop and the voltage is at rest.
 
     A device that takes no voltage ends it too, after the hold time. `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
+
+    Returns True where it stood still for the hold time and a period, as on a machine that stops the whole process:
+    the hardware's own watchdog may have acted, and the voltage that was due does not go out before somebody has looked
+    where the finger is.
     """
     clock = loop.clock
     resets = loop.orders.reset[0]
     voltage = before = loop.laws.feedforward_state.hysteresis.voltage[0]
-    begin(clock)
-    put_out = clock.edge[0]
+    if clock.edge[0] == 0:
+        begin(clock)
+    put_out = now(clock)
+    hold = round((loop.settings.hold_samples + 1.0) * clock.period)  # ns
     while loop.orders.stop[0] == 0 or (
         loop.watch.phase[0] != FAULT and loop.watch.unwritten[0] <= loop.settings.hold_samples
     ):
@@ -138,6 +144,9 @@ def run(loop: Loop, device: Any) -> None:
                 trip(loop.watch, loop.orders.fault[0], 0.0)
         judge_time(loop.settings, loop.watch, late * 1e-9, float(clock.missed[0] - missed))
         if loop.at_next_edge:
+            if now(clock) - put_out > hold:
+                follow(loop.laws, before)
+                return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
             put_out = now(clock)
@@ -151,12 +160,16 @@ def run(loop: Loop, device: Any) -> None:
         before = loop.laws.feedforward_state.hysteresis.voltage[0]
         voltage = sample(loop, status, device.reading, share, late)
         if not loop.at_next_edge:
+            if now(clock) - put_out > hold:
+                follow(loop.laws, before)
+                return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
             put_out = now(clock)
             judge_write(loop.settings, loop.laws, loop.watch, written, before)
     if loop.at_next_edge:
         follow(loop.laws, before)  # what was to go out next never does
+    return False
 
 
 def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int) -> float:
@@ -192,7 +205,7 @@ def sample(loop: Loop, status: int, reading: np.ndarray, share: float, late: int
     return voltage
 
 
-def loop_with(driver: Driver) -> Callable[[Loop, Any], None]:
+def loop_with(driver: Driver) -> Callable[[Loop, Any], bool]:
     """Return :func:`run` with the names `read` and `write` bound to those of a driver, compiled."""
     names = {**run.__globals__, "read": driver.read, "write": driver.write}
     return compiled(FunctionType(run.__code__, names, run.__name__))
@@ -232,14 +245,16 @@ class Servo:
         before an edge it stops sleeping (s).
     feeling : Feeling, optional
         With it the loop follows its reference no further than the force limit lets it, in place of the controller.
+    stands_at : float, optional
+        What a card whose driver does not say it puts out, in its unit, as far as the caller knows; NaN: nobody does.
 
     Raises ParameterError for a controller that does not fit, DriverError for a card that puts out what it cannot.
 
     Attributes
     ----------
     begins_at : float
-        What the card puts out before the first voltage (V), from where the loop leads it to rest. NaN: its driver
-        does not say, so it has to be at rest.
+        What the card puts out before the first voltage (V), from where the loop leads it to rest. NaN: nobody
+        says, so it has to be at rest.
     """
 
     def __init__(
@@ -252,6 +267,7 @@ class Servo:
         cpu: int = -1,
         spin: float = 5e-5,
         feeling: Feeling | None = None,
+        stands_at: float = math.nan,
     ) -> None:
         self.driver = driver
         self.parameters = parameters
@@ -260,7 +276,8 @@ class Servo:
         self._thread_options = (priority, cpu)
         self.complaint = ""
         law = Feedforward(feedforward, h)
-        self.begins_at = applied(driver, parameters.amplifier_gain, parameters.amplifier_zero)
+        self._scale = parameters.amplifier_gain, parameters.amplifier_zero
+        self.begins_at = applied(driver, *self._scale, stands_at)
         if not math.isnan(self.begins_at):
             law.follow(self.begins_at)
         ahead, kept = (1 << math.ceil(math.log2(max(span / h, 64))) for span in (2 * AHEAD, KEPT))
@@ -295,14 +312,30 @@ class Servo:
         self._loop.watch.phase[0] = FAULT
         self._run(self._loop, self.driver.device)  # returns at once: told to stop, and at rest
         self._loop.orders.stop[0] = 0
-        is_at_rest = self.voltage == self._loop.settings.voltage.rest
-        self._loop.watch.phase[0] = NORMAL if is_at_rest else RAMPING
+        self._loop.clock.edge[0] = 0  # it begins when it runs
+        self._look_where_it_is()  # compiling took its time
+        if self.phase == FAULT and self.cause_code == NO_CAUSE:
+            self._loop.watch.phase[0] = NORMAL
         self._thread.start()
         atexit.register(self.stop)
 
     def _work(self) -> None:
         self.complaint = become_real_time(*self._thread_options)
-        self._run(self._loop, self.driver.device)
+        while self._run(self._loop, self.driver.device):
+            self._look_where_it_is()
+
+    def _look_where_it_is(self) -> None:
+        """Let the models go where the card says that it is; a finger that was at rest is led there from elsewhere."""
+        watch = self._loop.watch
+        try:
+            voltage = applied(self.driver, *self._scale)
+        except DriverError:
+            trip(watch, DEVICE, 0.0)
+            return
+        if not math.isnan(voltage):
+            follow(self._loop.laws, voltage)
+        if self.phase == FAULT and self.voltage != self.rest:
+            watch.phase[0] = RAMPING
 
     @property
     def is_running(self) -> bool:
@@ -345,9 +378,10 @@ class Servo:
                 return stuck
         atexit.unregister(self.stop)
         left = ""
-        rest = self._loop.settings.voltage.rest
-        if self._thread.ident is not None and (self.voltage != rest or self.cause_code == DEVICE):
-            left = f"{self.cause}: left at {self.voltage:g} V, rest is {rest:g} V"
+        if self._thread.ident is not None and (
+            self.voltage != self.rest or self.cause_code == DEVICE
+        ):
+            left = f"{self.cause}: left at {self.voltage:g} V, rest is {self.rest:g} V"
         self.driver.close()
         return left
 
@@ -473,6 +507,11 @@ class Servo:
     def voltage(self) -> float:
         """The last voltage (V) that the device took."""
         return float(self._loop.laws.feedforward_state.hysteresis.voltage[0])
+
+    @property
+    def rest(self) -> float:
+        """The voltage (V) at which the finger is left alone."""
+        return self._loop.settings.voltage.rest
 
     @property
     def clipped(self) -> int:

@@ -6,7 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from piezo_control.parameters import ParameterError, parameter
-from piezo_control.safety import LARGEST_DEFLECTION, LARGEST_VOLTAGE, SafetyParameters
+from piezo_control.safety import (
+    LARGEST_DEFLECTION,
+    LARGEST_VOLTAGE,
+    SafetyParameters,
+    VoltageParameters,
+)
 
 
 @dataclass(frozen=True)
@@ -86,3 +91,16 @@ class ServoParameters(SafetyParameters):
             raise ParameterError(
                 f"'sensor_low' is {self.sensor_low!r} m, must be below 'sensor_high' ({self.sensor_high!r} m)"
             )
+
+    def output(self, voltage: float) -> float:
+        """Return what the card puts out, in its unit, for a voltage (V) at the finger."""
+        return self.amplifier_zero + voltage / self.amplifier_gain
+
+    def span(self, limits: VoltageParameters) -> str:
+        """Say within which voltages a finger stays, and what of the card that is: a scale that is wrong shows there."""
+        low, high, home = limits.voltage_low, limits.voltage_high, limits.rest
+        out = (self.output(voltage) for voltage in (low, high, home))
+        return (
+            f"{low:g} to {high:g} V, {home:g} V at rest; the card puts out "
+            "{:g} to {:g}, {:g} at rest".format(*out)
+        )

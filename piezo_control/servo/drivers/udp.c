@@ -12,6 +12,10 @@
  * One servo leads a finger. Its numbers rise from 1 on, and the finger applies no voltage whose number is not above the
  * last one. Number 0 says from the servo that it lets go, and brings its last voltage once more; from the finger that
  * somebody else leads it. A servo that is silent for the finger's hold time has let go as well.
+ *
+ * Anybody may ask what the finger puts out: the word "PZG?" in place of "PZG1", and any number; the finger answers with
+ * both and the voltage of now, which it neither changes nor holds for that. One that does not know the word gives no
+ * answer, and has to be at rest when a servo begins.
  */
 #define _GNU_SOURCE
 #include "piezo_driver.h"
@@ -36,13 +40,15 @@ struct datagram {
 struct piezo_device {
   int socket;
   int64_t limit; /* ns to wait for an answer */
-  uint64_t sent, received;
+  uint64_t sent, received, asked;
   double voltage; /* sent last */
   int64_t sent_at; /* ns */
   char error[160];
 };
 
-static const char WORD[8] = "PZG1";
+static const char WORD[8] = "PZG1", ASKS[8] = "PZG?";
+static const int ATTEMPTS = 3;
+static const int64_t PATIENCE = 20000000; /* ns for each */
 
 static int64_t now(void) {
   struct timespec t;
@@ -118,6 +124,32 @@ int piezo_write(piezo_device *device, double voltage) {
   return PIEZO_FRESH;
 }
 
+static void wait_for_datagram(piezo_device *device, int64_t limit) {
+  struct pollfd wait = {.fd = device->socket, .events = POLLIN};
+  struct timespec timeout = {.tv_sec = limit / 1000000000, .tv_nsec = limit % 1000000000};
+  ppoll(&wait, 1, &timeout, NULL);
+}
+
+int piezo_applied(piezo_device *device, double *voltage) {
+  for (int attempt = 0; attempt < ATTEMPTS; attempt++) {
+    struct datagram out = {.number = ++device->asked}, in;
+    memcpy(out.word, ASKS, sizeof ASKS);
+    (void)!send(device->socket, &out, sizeof out, MSG_DONTWAIT);
+    for (int64_t end = now() + PATIENCE;;) {
+      ssize_t size = recv(device->socket, &in, sizeof in, MSG_DONTWAIT);
+      if (size == (ssize_t)sizeof in && !memcmp(in.word, ASKS, sizeof ASKS) && in.number == device->asked) {
+        *voltage = in.value;
+        return PIEZO_FRESH;
+      }
+      if (size >= 0) continue;
+      int64_t rest = end - now();
+      if (rest <= 0 || (errno != EAGAIN && errno != EINTR)) break;
+      wait_for_datagram(device, rest);
+    }
+  }
+  return PIEZO_NONE_IN_TIME;
+}
+
 int piezo_read(piezo_device *device, struct piezo_reading *reading) {
   int64_t end = now() + device->limit;
   for (;;) {
@@ -140,10 +172,7 @@ int piezo_read(piezo_device *device, struct piezo_reading *reading) {
     }
     int64_t rest = end - now();
     if (device->received == device->sent || rest <= 0) return PIEZO_NONE_IN_TIME;
-    struct pollfd wait = {.fd = device->socket, .events = POLLIN};
-    struct timespec timeout = {.tv_nsec = (long)rest};
-    if (rest >= 1000000000) timeout = (struct timespec){.tv_sec = rest / 1000000000, .tv_nsec = rest % 1000000000};
-    ppoll(&wait, 1, &timeout, NULL);
+    wait_for_datagram(device, rest);
   }
 }
 
