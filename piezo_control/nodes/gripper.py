@@ -133,6 +133,7 @@ class Finger:
         self.push = math.nan  # N, of the object on the tip; NaN: the finger does not feel any
         self.max_force = 0.0  # N, of the goal; 0: the finger's own limit
         self._felt = 0  # number of the sample at which it felt that
+        self._last_heard = 0  # number of samples, by the state before the newest
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
         self._states = node.create_subscription(FingerState, f"{name}/state", self._take, LATCHED)
         self._pushes = node.create_subscription(Sample, f"{name}/push", self._feel, NEWEST)
@@ -223,7 +224,8 @@ class Finger:
         topic = self._node.resolve_topic_name(f"{self.name}/push")
         if math.isnan(self.push):
             return f"finger '{self.name}' has told no force yet on '{topic}'"
-        samples = self.state.samples - self._felt
+        # A gripper that stood still hears the newest state before the newest push.
+        samples = self._last_heard - self._felt
         if samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
             return f"finger '{self.name}' feels no more: nothing on '{topic}' for {samples} samples"
         return ""
@@ -270,6 +272,7 @@ class Finger:
 
     def _take(self, state: FingerState) -> None:
         restarted = self.state is not None and state.samples < self.state.samples
+        self._last_heard = 0 if self.state is None or restarted else self.state.samples
         self.state = state
         self.heard = monotonic()
         if restarted:
@@ -303,6 +306,7 @@ class GripperNode(FingerNode):
         self._stopped: Asker | None = None  # whose motion the node's end has ended
         self.goal: Goal | None = None  # the newest, until the fingers are somewhere else
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
+        self._watched = monotonic()
         self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
         self._serve_control_action()
         self.faces: list[JointStates | JointCommands | Services] = []
@@ -337,6 +341,7 @@ class GripperNode(FingerNode):
         ]
         self.faces = [JointStates(self), JointCommands(self), Services(self)]
         self._stopped = None
+        self._watched = monotonic()
         self.watchdog.reset()
 
     def stop(self) -> None:
@@ -390,11 +395,11 @@ class GripperNode(FingerNode):
         """Go for a goal from where the fingers are; whoever else asked for a motion is told so."""
         if self.asker is not asker:
             self._finish(failure("a new goal takes over"))
-        self.motion = Motion(self.parameters, goal, [finger.place() for finger in self.fingers])
+        self.motion = Motion(self.parameters, goal, [f.deflection for f in self.fingers])
         for finger in self.fingers:
-            # Opening keeps the force that is held: the references are ahead of the tips, and more would push on.
-            if self.motion.closing or not finger.max_force:
-                finger.max_force = goal.max_force
+            # Opening keeps the force that is held, or less: the references are ahead of the tips, and more would push on.
+            is_held = finger.max_force and not self.motion.closing
+            finger.max_force = min(goal.max_force, finger.max_force if is_held else math.inf)
         self.asker, self.goal = asker, goal
 
     def halt(self, reason: str) -> None:
@@ -463,6 +468,11 @@ class GripperNode(FingerNode):
             self._halt_motion(outcome)
 
     def _watch(self) -> None:
+        now = monotonic()
+        stood_still = now - self._watched > self.parameters.state_timeout / 2.0
+        self._watched = now
+        if stood_still:
+            return  # what the fingers said meanwhile is still to be heard
         if self.motion is None:
             missing = [finger.missing() for finger in self.fingers if finger.problem()]
             self.say(f"waits for {' and '.join(missing)}" if missing else "ready: both fingers run")
