@@ -283,6 +283,7 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
     assert (pushes[0].number, pushes[0].value) == (0, 0.0)
 
 
+@pytest.mark.shows("a feedback that is deactivated and activated again while the finger waits")
 def test_a_feedback_that_is_activated_again_goes_on_holding(neighbour, tmp_path):
     """Between two samples of lock-step, for which time stands still: not a bit of the commands changes."""
     limit, away, elastic_constant = 2e-4, 1e-6, 1e-3
@@ -319,7 +320,10 @@ def test_a_feedback_that_is_activated_again_goes_on_holding(neighbour, tmp_path)
 
 @pytest.mark.parametrize("feels", [True, False])
 def test_a_feedback_does_not_wind_up_against_a_finger_at_rest(neighbour, feels):
-    """Every command to a finger that a fault keeps at rest is the first of a law that begins there."""
+    """Every command to a finger that a fault keeps at rest is the first of a law that begins there.
+
+    Activated again while the finger runs, it goes on from its last command.
+    """
     node = FeedbackNode()
     values = {"mode": "free_running", "age_limit": 10.0, "force_control": feels}
     if not feels:  # an integrator
@@ -351,6 +355,9 @@ def test_a_feedback_does_not_wind_up_against_a_finger_at_rest(neighbour, feels):
     answers = neighbour.listen(Sample, "command")
     neighbour.wait(lambda: neighbour.node.count_subscribers("command"))
     for number in range(1, 16):
+        if number == 13:
+            assert node.trigger_deactivate() == node.trigger_activate()
+            node.armed = True
         phase = FingerState.FAULT if number <= 10 else FingerState.RUNNING
         states.publish(FingerState(phase=phase, reference=10e-6))
         neighbour.wait(lambda p=phase: node.finger and node.finger.phase == p)
