@@ -215,20 +215,23 @@ class Motion:
 
     Parameters
     ----------
-    references : sequence of two floats
-        Where the fingers' references are at the start (m).
+    deflections : sequence of two floats
+        Where the tips are at the start (m). It closes if one of them is to go on by more than is no way at all; a
+        reference that is ahead of its tip, to hold a force, is no place that was reached.
     """
 
     def __init__(
-        self, parameters: GripperParameters, goal: Goal, references: Sequence[float]
+        self, parameters: GripperParameters, goal: Goal, deflections: Sequence[float]
     ) -> None:
         self.goal = goal
         self._parameters = parameters
         openings = [waypoint.opening for waypoint in goal.waypoints] or [goal.opening]
-        self.closing = max(map(self._reference, openings)) > min(references)
-        self._arrivals = [math.inf] * len(references)
-        self._stall_times = [REST_TIME] * len(references)
-        self._places = [(math.inf, math.nan)] * len(references)  # since when (s) a tip is where (m)
+        way = max(map(self._reference, openings)) - min(deflections)
+        self.closing = way > parameters.tolerance / 2.0
+        self._arrivals = [math.inf] * len(deflections)
+        self._stall_times = [REST_TIME] * len(deflections)
+        nowhere = (math.inf, math.nan)  # since when (s) a tip is where (m)
+        self._places = [nowhere] * len(deflections)
         self._overdue = math.inf  # s after the ramp, when the settling time was first seen over
 
     def departed(self, finger: int) -> bool:

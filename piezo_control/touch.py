@@ -284,6 +284,10 @@ class Touch:
         self._coefficients = touch_coefficients(
             parameters, elastic_constant, sample_time, command_low, command_high
         )
+        self.reset()
+
+    def reset(self) -> None:
+        """Touch nothing, at command 0."""
         self.state = touch_rest()
 
     def step(self, reference: float, deflection: float, expected: float, max_force: float) -> float:

@@ -19,8 +19,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from piezo_control.gripper import (
@@ -147,6 +149,17 @@ def test_force_ends_closing_when_both_fingers_are_there_and_does_not_hinder_open
     assert decided(closing(), [2.0, 1.5], [10e-6, 5e-6], one).stalled  # and now at its end
     motion = Motion(DEFAULTS, Goal(40e-6, 1e-3, 20e-6), [5e-6, 5e-6])
     assert decided(motion, [1.5, 1.5], [5e-6, 5e-6], both) is None
+
+
+@pytest.mark.parametrize("opening, closes", [(28.5e-6, True), (29.9e-6, False), (31e-6, False)])
+def test_a_goal_short_of_references_that_hold_a_force_closes_if_the_tips_have_to(opening, closes):
+    """Tips at 5 µm, so 30 µm apart, are within half the tolerance of 29.9 µm; their references are 1 µm ahead."""
+    motion = Motion(DEFAULTS, Goal(opening, 0.2e-3, 20e-6), [5e-6, 5e-6])
+    for finger in (0, 1):
+        motion.depart(finger, 1.0, 6e-6)
+    outcome = decided(motion, [1.5, 1.5], [5e-6, 5e-6], [0.2e-3, 0.2e-3])
+    assert motion.closing is closes
+    assert (outcome is not None and outcome.stalled) is closes
 
 
 @pytest.mark.parametrize("period", [0.05, 0.1])
@@ -369,6 +382,46 @@ def test_grip_and_release_an_object(bench):
         assert line.value[-1] == pytest.approx(2e-6, abs=1e-15)
 
 
+def test_a_goal_with_less_force_lets_go_of_the_rest_in_whatever_direction(bench):
+    held = bench.grip(20e-6, 0.4e-3, 200e-6).result
+    answer = bench.grip(held.opening - 0.6e-6, 0.2e-3)  # between the tips and their references
+    assert (answer.status, answer.result.stalled) == (GoalStatus.STATUS_SUCCEEDED, True)
+    bench.wait(lambda: all(-s.tip_force < 1.1 * 0.2e-3 for s in bench.states.values()))
+    for reference in bench.references.values():
+        reference.clear()
+    assert bench.grip(36e-6, 0.1e-3).result.reached_goal
+    assert {r.max_force for sent in bench.references.values() for r in sent} == {0.1e-3}
+    bench.grip(20e-6, 0.4e-3, 200e-6)
+    for reference in bench.references.values():
+        reference.clear()
+    assert bench.grip(
+        36e-6
+    ).result.reached_goal  # the gripper's own limit is more: nobody asked for it
+    assert {r.max_force for sent in bench.references.values() for r in sent} == {0.4e-3}
+
+
+def test_an_object_stays_held_while_a_feedback_is_activated_again(bench):
+    limit, felt = 0.2e-3, []
+    assert bench.grip(20e-6, limit, 200e-6).result.stalled
+    patient = bench.node.create_client(SetParameters, "left/cantilever/set_parameters")
+    change = bench.node.create_client(ChangeState, "left/feedback/change_state")
+    bench.wait(lambda: patient.service_is_ready() and change.service_is_ready())
+    timeout = Parameter("reply_timeout", value=TIMEOUT).to_parameter_msg()  # on a busy machine
+    bench.result_of(patient.call_async(SetParameters.Request(parameters=[timeout])))
+    bench.node.create_subscription(
+        FingerState, "left/state", lambda s: felt.append(-s.tip_force), LATCHED
+    )
+    bench.wait(felt.__len__)
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+        request = ChangeState.Request(transition=Transition(id=transition))
+        assert bench.result_of(change.call_async(request)).success
+    later = bench.states["left"].samples + 2000
+    bench.wait(lambda: bench.states["left"].samples > later)
+    # 0.02 mN is what models of this plant are off by (docs/touch.md).
+    assert limit - 0.02e-3 < min(felt) <= max(felt) < limit + 0.02e-3
+    assert bench.grip(36e-6).result.reached_goal
+
+
 def test_ramp_passes_in_the_fingers_own_time(bench):
     heard = []
     bench.node.create_subscription(FingerState, "left/state", heard.append, LATCHED)
@@ -478,6 +531,27 @@ def test_silent_finger_aborts_the_goal(bench):
     answer = bench.result_of(handle.get_result_async())
     assert answer.status == GoalStatus.STATUS_ABORTED
     assert "finger 'left' is silent: nothing on '/left/state'" in bench.log.read_text()
+
+
+def test_a_gripper_that_stood_still_does_not_take_its_fingers_for_silent(bench):
+    """It looks again before it has heard what they said meanwhile; the motion goes on."""
+    handle = bench.send(10e-6, 0.0, SLOW)
+    bench.moving(handle)
+    gripper = bench.processes["gripper"]
+    gripper.send_signal(signal.SIGSTOP)
+    stopped = time.monotonic()
+    numbers = {side: bench.states[side].samples for side in SIDES}
+    # Twice the time after which a finger is taken for dead, and after which its push is.
+    bench.wait(lambda: time.monotonic() - stopped > 8.0)
+    bench.wait(lambda: all(bench.states[side].samples > numbers[side] + 10000 for side in SIDES))
+    for sent in bench.references.values():
+        sent.clear()
+    gripper.send_signal(signal.SIGCONT)
+    for side in SIDES:
+        bench.wait(lambda k=side: len(bench.references[k]) > 5)
+    assert "is silent" not in bench.log.read_text()
+    assert "feels no more" not in bench.log.read_text()
+    assert handle.status == GoalStatus.STATUS_EXECUTING
 
 
 @pytest.mark.parametrize("end", ["deactivation", "SIGINT", "SIGINT before the client asks"])

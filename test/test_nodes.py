@@ -31,6 +31,7 @@ from sensor_msgs.msg import Temperature
 from piezo_control.dynamics import DynamicsParameters
 from piezo_control.feedback import Feedback, FeedbackParameters
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.nodes.feedback import FeedbackNode
 from piezo_control.nodes.qos import FAULTS, FOLLOWED, LATCHED, SAMPLE, SETPOINT
 from piezo_control.nodes.recorder import RecorderNode
 from piezo_control.nodes.sole_input import SoleInput
@@ -281,6 +282,95 @@ def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neigh
     assert [a.value for a in answers[first - 1 :]] == commands
     assert all(a.by_controller for a in answers)
     assert (pushes[0].number, pushes[0].value) == (0, 0.0)
+
+
+@pytest.mark.shows("a feedback that is deactivated and activated again while the finger waits")
+def test_a_feedback_that_is_activated_again_goes_on_holding(neighbour, tmp_path):
+    """Between two samples of lock-step, for which time stands still: not a bit of the commands changes."""
+    limit, away, elastic_constant = 2e-4, 1e-6, 1e-3
+    law = Touch(TouchParameters(), elastic_constant, 1e-4, -22e-6, 22e-6)
+    rows = [(n, min(0.2e-6 * n, away), 0.2e-6 * n) for n in range(40)]  # number, m, m
+    commands = [law.step(10e-6, *row[1:], limit) for row in rows]
+    states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+    states.publish(FingerState(phase=FingerState.RUNNING, reference=10e-6))
+    told = neighbour.node.create_publisher(Dynamics, "dynamics", LATCHED)
+    tip = DynamicsParameters(elastic_constant=elastic_constant)
+    told.publish(Dynamics(denominator=tip.denominator, elastic_constant=elastic_constant))
+    profile = neighbour.node.create_publisher(Profile, "reference_profile", LATCHED)
+    profile.publish(Profile(time=[0.0], value=[10e-6], max_force=limit))
+    with node("feedback", tmp_path, force_control=True):
+        answers = neighbour.listen(Sample, "command")
+        expected = neighbour.publisher("expected", LATCHED)
+        deflection = neighbour.publisher("deflection")
+        for latched in (states, told, profile):
+            neighbour.wait(latched.get_subscription_count)
+            assert latched.wait_for_all_acked()
+        for number, value, unhindered in rows:
+            if number == 20:
+                assert neighbour.change_state("feedback", Transition.TRANSITION_DEACTIVATE)
+                assert neighbour.change_state("feedback", Transition.TRANSITION_ACTIVATE)
+            expected.publish(sample(number, unhindered))
+            neighbour.insist(
+                deflection,
+                sample(number, value),
+                lambda n=number: answers and answers[-1].number == n,
+            )
+    found = {a.number: a.value for a in answers}
+    assert [found[number] for number, *_ in rows] == commands
+
+
+@pytest.mark.parametrize("feels", [True, False])
+def test_a_feedback_does_not_wind_up_against_a_finger_at_rest(neighbour, feels):
+    """Every command to a finger that a fault keeps at rest is the first of a law that begins there.
+
+    Activated again while the finger runs, it goes on from its last command.
+    """
+    node = FeedbackNode()
+    values = {"mode": "free_running", "age_limit": 10.0, "force_control": feels}
+    if not feels:  # an integrator
+        values |= {
+            "controller": "state_space",
+            "name": "integral",
+            "a": [1.0],
+            "b": [1.0],
+            "c": [0.02],
+        }
+        values |= {"anti_windup": [1.0]}
+    changes = [Parameter(name, value=value) for name, value in values.items()]
+    result = node.set_parameters_atomically(changes)
+    assert result.successful, result.reason
+    neighbour.executor.add_node(node)
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node.armed = True  # how fast samples come is not the matter here
+    told = neighbour.node.create_publisher(Dynamics, "dynamics", LATCHED)
+    tip = DynamicsParameters(elastic_constant=1e-3)
+    told.publish(Dynamics(denominator=tip.denominator, elastic_constant=tip.elastic_constant))
+    states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
+    deflection = neighbour.publisher("deflection")
+    reference = neighbour.publisher("reference", SETPOINT)
+    reference.publish(sample(0, 10e-6))
+    if feels:
+        neighbour.publisher("expected", LATCHED).publish(sample(1, 0.0))
+        neighbour.wait(lambda: node.touch and node.expected.number == 1)
+    neighbour.wait(lambda: node.reference.is_known)
+    answers = neighbour.listen(Sample, "command")
+    neighbour.wait(lambda: neighbour.node.count_subscribers("command"))
+    for number in range(1, 16):
+        if number == 13:
+            assert node.trigger_deactivate() == node.trigger_activate()
+            node.armed = True
+        phase = FingerState.FAULT if number <= 10 else FingerState.RUNNING
+        states.publish(FingerState(phase=phase, reference=10e-6))
+        neighbour.wait(lambda p=phase: node.finger and node.finger.phase == p)
+        neighbour.insist(
+            deflection, sample(number, 0.0), lambda n=number: answers and answers[-1].number == n
+        )
+    node.trigger_shutdown()
+    neighbour.executor.remove_node(node)
+    node.destroy_node()
+    commands = [a.value for a in sorted(answers, key=lambda a: a.number)]
+    assert len(set(commands[:10])) == 1
+    assert sorted(commands[9:]) == commands[9:] and commands[-1] > commands[9]
 
 
 def test_a_finger_that_would_swing_itself_up_is_not_answered(neighbour, tmp_path):

@@ -50,7 +50,7 @@ from piezo_control.parameters import ParameterError, build, flatten
 from piezo_control.profile import SampledSignal
 from piezo_control.safety import LARGEST_DEFLECTION, RateWatch, is_physical
 from piezo_control.touch import Touch
-from piezo_gripper_msgs.msg import Dynamics, Sample
+from piezo_gripper_msgs.msg import Dynamics, FingerState, Sample
 
 PUSH_PERIOD = 1e-2  # s, between two of the push
 
@@ -76,6 +76,9 @@ class FeedbackNode(BlockNode):
         self.dynamics: DynamicsParameters | None = None
         self._undoes_temperature = True  # the feedforward, as long as none says that it does not
         self.create_subscription(Dynamics, "dynamics", self._on_dynamics, LATCHED)
+        self._is_held = (
+            False  # the finger, where the last answer left it, while this node is inactive
+        )
         self._file = ""
         self._loading = False
         self._take_file()
@@ -145,8 +148,28 @@ class FeedbackNode(BlockNode):
         p = self.parameters
         self.law = Feedback(p)
         self.touch = self._touching(p)
-        self.rate = RateWatch(p.sample_time)
+        self._begin_to_watch()
+
+    def _wait_at_rest(self) -> None:
+        """Begin anew with each sample of a finger that goes to rest, so that no law winds up against it."""
+        self.law.reset()
+        if self.touch:
+            self.touch.reset()
+
+    def _begin_to_watch(self) -> None:
+        """See anew whether the loop keeps its sample time."""
+        self.rate = RateWatch(self.parameters.sample_time)
         self.armed = not self._has_a_rate()
+
+    def _may_go_on(self) -> bool:
+        """Say whether an activation finds the finger held where the last answer left it.
+
+        The law then goes on from there: one that began at rest would let go of what the finger holds.
+        """
+        before, now = self.law.parameters, self.parameters
+        fixed = ("mode", "sample_time", "force_control")
+        is_same = all(getattr(before, name) == getattr(now, name) for name in fixed)
+        return is_same and self._is_held and not self.guard.is_latched
 
     def _touching(self, p: FeedbackNodeParameters) -> Touch | None:
         """Return the law of a finger that feels; raise ParameterError for one that would swing itself up."""
@@ -194,8 +217,14 @@ class FeedbackNode(BlockNode):
 
     def start(self) -> None:
         self._take_file()
+        run = self.sequence if self._may_go_on() else None
         super().start()
-        self.restart()
+        if run:
+            self.sequence = run
+            self._begin_to_watch()
+            self.apply()
+        else:
+            self.restart()
         p = self.parameters
         if p.force_control:
             self.expected = Sample()
@@ -230,6 +259,16 @@ class FeedbackNode(BlockNode):
             self.destroy_publisher(self._pushes)
             self._expectations = self._pushes = None
         self.answers.finish(DELIVERY_TIMEOUT)
+        self._is_held = self.sequence.next > 0 and self._holds()
+
+    def _on_state(self, state: FingerState) -> None:
+        super()._on_state(state)
+        self._is_held = self._is_held and self._holds()
+
+    def _holds(self) -> bool:
+        """Say whether the finger's state tells of no way to rest and no new run."""
+        held = (FingerState.RUNNING, FingerState.HOLDING)
+        return self.finger is not None and self.finger.phase in held
 
     def apply(self) -> None:
         if not self._take_file():
@@ -243,6 +282,8 @@ class FeedbackNode(BlockNode):
 
     def _started(self, parameters: FeedbackNodeParameters) -> Feedback:
         """Return the law of `parameters`, started where the loop is; ValueError when it cannot be."""
+        if parameters == self.law.parameters:
+            return self.law
         law = Feedback(parameters)
         if self.sequence.next > 0:
             law.start(self.asked[self.sequence.next - 1], self.deflection, self.last.value)
@@ -308,8 +349,11 @@ class FeedbackNode(BlockNode):
 
     def compute(self, sample: Sample, answer: Sample) -> bool:
         self.deflection = sample.value
-        if self.parameters.mode == "free_running" and not self._is_in_time():
-            return False
+        if self.parameters.mode == "free_running":
+            if not self._is_in_time():
+                return False
+            if self.finger and self.finger.phase in (FingerState.RAMPING, FingerState.FAULT):
+                self._wait_at_rest()
         if self.finger and not self.reference.is_known:
             self.reference.hold(self.finger.reference)  # that of a feedback before this one
         self.reference.say(sample.header)

@@ -25,7 +25,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from time import monotonic
 from typing import Any
 
 from rclpy.client import Client
@@ -128,11 +127,12 @@ class Finger:
         self._before: list[Profile] = []  # what the states show until it has arrived
         self._sent = -math.inf
         self.zero = 0.0  # m, the deflection at which the finger is at rest
-        self.heard = monotonic()
+        self.heard = node.listened
         self._way: deque[tuple[float, float]] = deque()  # times (s) and deflections (m) of late
         self.push = math.nan  # N, of the object on the tip; NaN: the finger does not feel any
         self.max_force = 0.0  # N, of the goal; 0: the finger's own limit
         self._felt = 0  # number of the sample at which it felt that
+        self._felt_at = -math.inf  # s, when that was heard
         self._profiles = node.create_publisher(ProfileMessage, f"{name}/reference_profile", LATCHED)
         self._states = node.create_subscription(FingerState, f"{name}/state", self._take, LATCHED)
         self._pushes = node.create_subscription(Sample, f"{name}/push", self._feel, NEWEST)
@@ -184,7 +184,7 @@ class Finger:
 
     def silence(self) -> str:
         """Return that the finger is taken for dead, or nothing."""
-        silence = monotonic() - self.heard
+        silence = self._node.listened - self.heard
         if self.state is not None and silence <= self._node.parameters.state_timeout:
             return ""
         topic = self._node.resolve_topic_name(f"{self.name}/state")
@@ -224,7 +224,8 @@ class Finger:
         if math.isnan(self.push):
             return f"finger '{self.name}' has told no force yet on '{topic}'"
         samples = self.state.samples - self._felt
-        if samples * self._node.parameters.sample_time > PUSH_TIMEOUT:
+        is_late = samples * self._node.parameters.sample_time > PUSH_TIMEOUT
+        if is_late and self._node.listened - self._felt_at > self._node.parameters.state_timeout:
             return f"finger '{self.name}' feels no more: nothing on '{topic}' for {samples} samples"
         return ""
 
@@ -267,13 +268,14 @@ class Finger:
     def _feel(self, push: Sample) -> None:
         self.push = push.value
         self._felt = push.number
+        self._felt_at = self._node.listened
 
     def _take(self, state: FingerState) -> None:
         if self not in self._node.fingers:
             return  # it was on its way when the gripper was stopped
         restarted = self.state is not None and state.samples < self.state.samples
         self.state = state
-        self.heard = monotonic()
+        self.heard = self._node.listened
         if restarted:
             self._way.clear()
             self.push = math.nan
@@ -305,6 +307,8 @@ class GripperNode(FingerNode):
         self._stopped: Asker | None = None  # whose motion the node's end has ended
         self.goal: Goal | None = None  # the newest, until the fingers are somewhere else
         self.watchdog = self.create_steady_timer(WATCH_PERIOD, self._watch, autostart=False)
+        self.listened = 0.0
+        """Time (s) it has listened for: counted, so that one that stood still takes nobody for silent."""
         self.actions: list[ActionFace] = [GripFace(self, "grip")]  # there when inactive, to refuse
         self._serve_control_action()
         self.faces: list[JointStates | JointCommands | Services] = []
@@ -392,11 +396,11 @@ class GripperNode(FingerNode):
         """Go for a goal from where the fingers are; whoever else asked for a motion is told so."""
         if self.asker is not asker:
             self._finish(failure("a new goal takes over"))
-        self.motion = Motion(self.parameters, goal, [finger.place() for finger in self.fingers])
+        self.motion = Motion(self.parameters, goal, [f.deflection for f in self.fingers])
         for finger in self.fingers:
-            # Opening keeps the force that is held: the references are ahead of the tips, and more would push on.
-            if self.motion.closing or not finger.max_force:
-                finger.max_force = goal.max_force
+            # Opening keeps the force that is held, or less: the references are ahead of the tips, and more would push on.
+            is_held = finger.max_force and not self.motion.closing
+            finger.max_force = min(goal.max_force, finger.max_force if is_held else math.inf)
         self.asker, self.goal = asker, goal
 
     def halt(self, reason: str) -> None:
@@ -465,6 +469,7 @@ class GripperNode(FingerNode):
             self._halt_motion(outcome)
 
     def _watch(self) -> None:
+        self.listened += WATCH_PERIOD
         if self.motion is None:
             missing = [finger.missing() for finger in self.fingers if finger.problem()]
             self.say(f"waits for {' and '.join(missing)}" if missing else "ready: both fingers run")
