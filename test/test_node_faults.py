@@ -457,7 +457,15 @@ def test_a_stray_number_ahead_leaves_the_voltage_where_it_is(neighbour, tmp_path
         voltages = neighbour.listen(Sample, "voltage")
         stream = Stream(neighbour, "command", 18e-6)
         neighbour.wait(lambda: voltages and voltages[-1].value > 30.0)
-        stream.publisher.publish(sample(10**6, 18e-6))
+        ahead = (
+            10**6
+        )  # again and again: a newer command takes its place before a busy feedforward has read it
+        neighbour.insist(
+            stream.publisher,
+            sample(ahead, 18e-6),
+            lambda: any(v.number == ahead for v in voltages),
+            period=0.003,
+        )
         neighbour.wait(lambda: "counts anew" in log(tmp_path, "feedforward"))
         count = len(voltages)
         neighbour.wait(lambda: len(voltages) > count + 5)

@@ -44,6 +44,7 @@ from piezo_control.feedback import (
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode, command_range
 from piezo_control.nodes.parameters import FeedbackNodeParameters
+from piezo_control.nodes.phases import TAKES_NONE
 from piezo_control.nodes.profile_input import ProfileInput
 from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, SAMPLE
 from piezo_control.parameters import ParameterError, build, flatten
@@ -151,7 +152,7 @@ class FeedbackNode(BlockNode):
         self._begin_to_watch()
 
     def _wait_at_rest(self) -> None:
-        """Begin anew with each sample of a finger that goes to rest, so that no law winds up against it."""
+        """Begin anew with each sample of a finger that takes no voltage, so that no law winds up against it."""
         self.law.reset()
         if self.touch:
             self.touch.reset()
@@ -352,7 +353,7 @@ class FeedbackNode(BlockNode):
         if self.parameters.mode == "free_running":
             if not self._is_in_time():
                 return False
-            if self.finger and self.finger.phase in (FingerState.RAMPING, FingerState.FAULT):
+            if self.finger and self.finger.phase in TAKES_NONE:
                 self._wait_at_rest()
         if self.finger and not self.reference.is_known:
             self.reference.hold(self.finger.reference)  # that of a feedback before this one

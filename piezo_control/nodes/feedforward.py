@@ -31,6 +31,7 @@ from piezo_control.feedforward import Feedforward
 from piezo_control.nodes import base
 from piezo_control.nodes.block import BlockNode
 from piezo_control.nodes.parameters import FeedforwardNodeParameters
+from piezo_control.nodes.phases import TAKES_NONE
 from piezo_control.nodes.qos import DELIVERY_TIMEOUT, LATCHED, SAMPLE
 from piezo_control.nodes.temperature_input import TemperatureInput
 from piezo_control.safety import (
@@ -45,8 +46,6 @@ from piezo_control.sensorless import Sensorless
 from piezo_control.sequence import grid_index
 from piezo_control.thermometer import Thermometer
 from piezo_gripper_msgs.msg import Dynamics, FingerState, Sample
-
-TAKES_NONE = (FingerState.WAITING, FingerState.RAMPING, FingerState.FAULT)  # phases of a finger
 
 
 class FeedforwardNode(BlockNode):

@@ -96,8 +96,8 @@ class GripperNodeParameters(GripperParameters):
         2e-6, "largest deflection that `~/zero` takes for 0", unit="m", low=0.0, high=1e-4
     )
     state_timeout: float = parameter(
-        1.0, "a finger whose state is older is taken for dead (wall clock)", unit="s", low=0.2,
-        high=60.0,
+        1.0, "a finger whose state is older is taken for dead; what the gripper itself stood still does not count",
+        unit="s", low=0.2, high=60.0,
     )  # fmt: skip
 
     def __post_init__(self) -> None:
