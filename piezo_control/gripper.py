@@ -39,7 +39,7 @@ HOLD_BEYOND = 1e-6
 """How far (m) a reference stays ahead of a tip that holds a force."""
 
 AT_LIMIT = 0.9
-"""Share of the force limit from which on a finger has stalled."""
+"""Share of the force limit from which on a finger has stalled; what pushes with more than the limit over it still eases."""
 
 REST_TIME = 0.05
 """A finger rests when it has stayed in place for so long (s); one that stalls, for as long as its line has to move it."""
@@ -282,7 +282,8 @@ class Motion:
         stands = all(time >= enough for time, enough in zip(still, self._stall_times))
         over = [time - arrival for time, arrival in zip(times, self._arrivals)]
         stalled = [push >= AT_LIMIT * self.goal.max_force for push in pushes]
-        if self.closing and any(stalled) and stands:
+        eased = not any(push > self.goal.max_force / AT_LIMIT for push in pushes)
+        if self.closing and any(stalled) and stands and eased:
             # A finger that touches nothing goes on to the end of its line.
             if all(at_limit or late >= 0.0 for at_limit, late in zip(stalled, over)):
                 text = f"stopped by {force:g} N, limit {self.goal.max_force:g} N"

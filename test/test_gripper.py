@@ -151,6 +151,13 @@ def test_force_ends_closing_when_both_fingers_are_there_and_does_not_hinder_open
     assert decided(motion, [1.5, 1.5], [5e-6, 5e-6], both) is None
 
 
+def test_a_force_above_the_limit_has_to_ease_first():
+    """A stiff object hardly moves the tips meanwhile; 1/0.9 of the limit of 1 mN is as near as 0.9 of it."""
+    motion, place = closing(), [5e-6, 5e-6]
+    assert decided(motion, [1.5, 1.5], place, [1e-3, 1.12e-3]) is None
+    assert motion.decide([1.6, 1.6], place, [1e-3, 1.11e-3]).stalled
+
+
 @pytest.mark.parametrize("opening, closes", [(28.5e-6, True), (29.9e-6, False), (31e-6, False)])
 def test_a_goal_short_of_references_that_hold_a_force_closes_if_the_tips_have_to(opening, closes):
     """Tips at 5 µm, so 30 µm apart, are within half the tolerance of 29.9 µm; their references are 1 µm ahead."""
