@@ -54,7 +54,7 @@ faults: env
 	$(RUN) python test/faults.py
 
 coverage: env
-	$(RUN) coverage erase && coverage run -m pytest && coverage combine --quiet && coverage report
+	$(RUN) coverage erase && coverage run -m pytest -n 2 --dist loadfile && coverage combine --quiet && coverage report
 
 docs: env build/docs/installed
 	$(RUN) PYTHONPATH=build/docs:$$PYTHONPATH python -m sphinx -W --keep-going --quiet docs out/docs
