@@ -444,6 +444,26 @@ def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tm
     assert re.match(r"no answer to sample 2 .*'/command' or '/voltage'", state.text)
 
 
+def test_a_cantilever_that_stood_still_hears_its_answer_first(neighbour, tmp_path):
+    with node("cantilever", tmp_path) as processes:
+        deflections = neighbour.listen(Sample, "deflection")
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        voltage = neighbour.publisher("voltage")
+        neighbour.wait(lambda: deflections)
+        neighbour.insist(voltage, sample(0, 0.0), lambda: deflections[-1].number == 1)
+        asked = len(deflections)
+        neighbour.wait(
+            lambda: len(deflections) > asked + 1
+        )  # sample 1 once more: it is late already
+        process = processes.running["cantilever"]
+        process.send_signal(signal.SIGSTOP)
+        before = time.monotonic()
+        neighbour.wait(lambda: time.monotonic() - before > 3.0)  # `reply_timeout` is 2 s
+        process.send_signal(signal.SIGCONT)
+        neighbour.insist(voltage, sample(1, 0.0), lambda: deflections[-1].number == 2)
+        assert all(s.phase != FingerState.FAULT for s in states)
+
+
 @pytest.mark.shows("SIGKILL of a node")
 def test_cantilever_names_the_missing_node(neighbour, tmp_path):
     with node("cantilever", tmp_path):

@@ -113,7 +113,8 @@ class CantileverNode(FingerNode):
         self._reset()
         self.teller.timer_period_ns = round(self.parameters.state_period * 1e9)
         self._enter(FingerState.WAITING)
-        self.heard = self.begun = monotonic()
+        self.begun = monotonic()
+        self.silence = 0.0
         if wrong := self._wrong():
             self._fault(wrong)
         if self.parameters.mode == "lockstep":
@@ -281,11 +282,12 @@ class CantileverNode(FingerNode):
         """Ask again for what is late; give up when it stays away."""
         if self.number != self.watched:
             self.watched = self.number
-            self.heard = monotonic()
+            self.silence = 0.0
             return
-        silence = monotonic() - self.heard
-        if self.phase == FingerState.RUNNING and silence > self.parameters.reply_timeout:
-            self._fault(f"no answer to sample {self.number} for {silence:.1f} s: {self._missing()}")
+        self.silence += RETRY_PERIOD  # counted: one that stood still has not heard what is there
+        if self.phase == FingerState.RUNNING and self.silence > self.parameters.reply_timeout:
+            words = f"no answer to sample {self.number} for {self.silence:.1f} s"
+            self._fault(f"{words}: {self._missing()}")
             return
         if self.phase == FingerState.WAITING:
             self.text = f"waiting for sample 0: {self._missing()}"
