@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import importlib
 import re
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import requires
 from io import TextIOWrapper
 from pathlib import Path
@@ -25,6 +27,8 @@ PART_OF = {
     "zstandard": "rosbags",
 }
 LOOK_PERIOD = 0.02  # s, between two looks at whether a signal came
+FREEING = 5.0  # s that the middleware may take to free what a program has had of it
+CLOCK_MONOTONIC, SIGEV_THREAD = 1, 2  # of <time.h> and <signal.h>
 
 
 class Stop:
@@ -81,6 +85,41 @@ def stop_at_signals() -> Stop:
             signal.signal(number, stop.set)
             atexit.register(signal.signal, number, signal.SIG_IGN)
     return stop
+
+
+class SignalEvent(ctypes.Structure):
+    """The `struct sigevent` of Linux, for a timer that calls a function in a thread of its own."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("rest", ctypes.c_char * 32),
+    )
+
+
+@contextmanager
+def over_within(seconds: float, code: int) -> Iterator[None]:
+    """End the program with an exit code where what is done here, when its work is done, takes longer than `seconds`.
+
+    Fast DDS hangs now and then where it is freed in the very moment in which other programs leave too, as after one
+    Ctrl-C for all: it waits for its own discovery, which waits for it. It has the interpreter's lock meanwhile, so that
+    neither a thread nor a signal's handler in Python could end that; the timer of the system calls `_exit` by itself.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    last_step = ctypes.cast(libc._exit, ctypes.c_void_p)
+    event = SignalEvent(code, 0, SIGEV_THREAD, last_step, None)
+    timer = ctypes.c_void_p()
+    if libc.timer_create(CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
+        raise OSError(ctypes.get_errno(), "no timer")
+    once = (ctypes.c_long * 4)(0, 0, int(seconds), round(seconds % 1.0 * 1e9))
+    libc.timer_settime(timer, 0, ctypes.byref(once), None)
+    try:
+        yield
+    finally:
+        libc.timer_delete(timer)
 
 
 def how_to_get(package: str) -> str:

@@ -540,27 +540,6 @@ def test_silent_finger_aborts_the_goal(bench):
     assert "finger 'left' is silent: nothing on '/left/state'" in bench.log.read_text()
 
 
-def test_a_gripper_that_stood_still_does_not_take_its_fingers_for_silent(bench):
-    """It looks again before it has heard what they said meanwhile; the motion goes on."""
-    handle = bench.send(10e-6, 0.0, SLOW)
-    bench.moving(handle)
-    gripper = bench.processes["gripper"]
-    gripper.send_signal(signal.SIGSTOP)
-    stopped = time.monotonic()
-    numbers = {side: bench.states[side].samples for side in SIDES}
-    # Twice the time after which a finger is taken for dead, and after which its push is.
-    bench.wait(lambda: time.monotonic() - stopped > 8.0)
-    bench.wait(lambda: all(bench.states[side].samples > numbers[side] + 10000 for side in SIDES))
-    for sent in bench.references.values():
-        sent.clear()
-    gripper.send_signal(signal.SIGCONT)
-    for side in SIDES:
-        bench.wait(lambda k=side: len(bench.references[k]) > 5)
-    assert "is silent" not in bench.log.read_text()
-    assert "feels no more" not in bench.log.read_text()
-    assert handle.status == GoalStatus.STATUS_EXECUTING
-
-
 @pytest.mark.parametrize("end", ["deactivation", "SIGINT", "SIGINT before the client asks"])
 def test_stopped_gripper_holds_and_lets_the_client_know(bench, end):
     handle = bench.send(10e-6, 0.0, SLOW)

@@ -644,6 +644,27 @@ def test_events_that_were_on_their_way_when_a_gripper_was_stopped_change_nothing
     rclpy.shutdown()
 
 
+def test_a_gripper_counts_silence_in_the_time_that_it_has_listened_for():
+    """One that stood still looks again before it has heard what its fingers said meanwhile; `state_timeout` is 1 s."""
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    finger = node.fingers[0]
+    finger._feel(sample(100, 1e-4))
+    finger._take(FingerState(phase=FingerState.RUNNING, samples=60_000, period=1e-4))
+    assert not finger.problem()  # the push of 6 s ago is the newest that was heard of so far
+    for _ in range(10):
+        node._watch()
+    assert not finger.problem()
+    node._watch()
+    assert "finger 'left' is silent: nothing on '/left/state' for 1.1 s" in finger.problem()
+    finger._take(FingerState(phase=FingerState.RUNNING, samples=61_000, period=1e-4))
+    assert "finger 'left' feels no more: nothing on '/left/push' for 60900" in finger.problem()
+    node.destroy_node()
+    rclpy.shutdown()
+
+
 @pytest.mark.parametrize("phase, place", [(FingerState.HOLDING, 7e-6), (FingerState.RAMPING, 0.0)])
 def test_a_finger_that_bridges_a_late_sample_lets_nothing_go(phase, place):
     """Its reference stays; that of one on its way to rest becomes the place where it will be."""
@@ -692,6 +713,24 @@ def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     process.send_signal(signal.SIGINT)
     _, words = process.communicate(timeout=TIMEOUT)
     assert (process.returncode, words) == (-signal.SIGINT, "")
+
+
+def test_a_middleware_that_hangs_with_the_interpreters_lock_does_not_keep_a_program_from_its_end(
+    tmp_path,
+):
+    (tmp_path / "program.py").write_text(
+        "import ctypes, time\n"
+        "from piezo_control.start import over_within\n"
+        "with over_within(0.2, 7):\n"
+        "    pass\n"
+        "time.sleep(0.5)\n"
+        "print('on', flush=True)\n"
+        "with over_within(0.2, 3):\n"
+        "    ctypes.PyDLL(None).sleep(100)\n"
+    )
+    program = [sys.executable, tmp_path / "program.py"]
+    result = subprocess.run(program, capture_output=True, text=True, timeout=TIMEOUT)
+    assert (result.returncode, result.stdout, result.stderr) == (3, "on\n", "")
 
 
 @pytest.mark.shows("a signal while another one is being handled")

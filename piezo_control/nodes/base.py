@@ -47,7 +47,7 @@ from piezo_control.parameters import (
     unknown,
 )
 from piezo_control.safety import PHASES, Guard
-from piezo_control.start import stop_at_signals
+from piezo_control.start import FREEING, over_within, stop_at_signals
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 FAREWELL = 2.0  # s: so long the end of a program waits for those who have still to be told
@@ -382,6 +382,7 @@ def run(*node_types: type[FingerNode]) -> int:
     """
     stop = stop_at_signals()
     nodes: list[FingerNode] = []
+    code = 2
     try:
         parse(node_types)
         spin.init()
@@ -405,22 +406,23 @@ def run(*node_types: type[FingerNode]) -> int:
                 node.trigger_shutdown()
             end = time.monotonic() + FAREWELL
             serve(lambda: time.monotonic() > end or all(node.is_told() for node in nodes))
+        code = 0
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
         name, text = node_types[min(len(nodes), len(node_types) - 1)].NAME, str(error)
         if files := [path for path in parameter_files() if path not in text]:
             text += f"; parameters come from {', '.join([*files, *{'-p'} & set(sys.argv)])}"
         print(f"{name}: {text}", file=sys.stderr)
-        return 2
     except (RCLError, RCLInvalidROSArgsError, UnknownROSArgsError) as error:
         # A parameter file or an argument that rcl cannot read; its first line names it.
         print(f"{node_types[0].NAME}: {str(error).splitlines()[0]}", file=sys.stderr)
-        return 2
     finally:
         for node in reversed(nodes):
             node.trigger_shutdown()
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+        with over_within(FREEING, code):
+            for node in reversed(nodes):
+                node.destroy_node()
+            rclpy.try_shutdown()
+    return code
 
 
 def parameter_files() -> list[str]:

@@ -71,6 +71,7 @@ MODEL_TOLERANCE, CYCLE_AMPLITUDE, ON_TARGET = 0.75, 0.125, 0.0125  # of the stro
 FROZEN_VOLTAGE = 0.05  # of the range of the voltage
 LARGEST_NOISE = 8.0  # standard deviations of the readings that no watchdog takes for more
 ATTEMPTS = 3
+LATE_ATTEMPTS = 10  # where readings come late: short, and there is nothing to choose from
 GOOD_MISSING_SHARE, LARGEST_MISSING_SHARE = 0.01, 0.1  # of the readings
 
 
@@ -120,7 +121,7 @@ class Bench:
         Again where readings came late, as on a machine that is busy for a moment. Raises NoAnswer when the servo ends
         it otherwise, DriverError when the device does not open.
         """
-        for _ in range(ATTEMPTS - 1):
+        for _ in range(LATE_ATTEMPTS - 1):
             with suppress(LateReadings):
                 return self._move(voltage, duration)
         return self._move(voltage, duration)
