@@ -2,6 +2,7 @@
 """The client and `fingerctl` with a running finger and its recorder."""
 
 import io
+import math
 import os
 import signal
 import subprocess
@@ -66,7 +67,9 @@ def ros(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def finger(ros):
-    return ros.finger()
+    finger = ros.finger()
+    finger.wait_for(lambda: math.isfinite(finger.newest().number))
+    return finger
 
 
 @pytest.fixture
@@ -178,7 +181,7 @@ def test_the_reference_is_the_one_that_is_followed_also_for_who_joins_later(ros,
     finger.wait_for(lambda: finger.newest().reference == 6e-6)
     with connect(TIMEOUT) as later:
         late = later.finger("finger")
-        late.wait_for(lambda: late.state is not None)
+        late.wait_for(lambda: late.state and math.isfinite(late.newest().number))
         assert late.newest().reference == 6e-6
         wave = Waveform("sine", amplitude=5e-6, frequency=2.0)
         waveforms.publish(waveform_message(wave))

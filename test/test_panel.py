@@ -402,6 +402,7 @@ def ros(panel):
 def left(ros):
     finger = ros.finger("left")
     finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+    finger.wait_for(lambda: math.isfinite(finger.newest().number))
     yield finger
     finger.zero()
     finger.wait_for(near(finger, 0.0))

@@ -746,6 +746,7 @@ def test_the_client_moves_a_servo_and_hears_what_it_follows(tmp_path):
         with connect(2 * TIMEOUT) as ros:
             finger = ros.finger("real")
             finger.wait_for(lambda: finger.state and finger.state.phase == FingerState.RUNNING)
+            finger.wait_for(lambda: math.isfinite(finger.newest().number))
             finger.wave(Waveform("triangle", 5e-6, frequency=2.0, offset=10e-6))
             start = finger.newest().time + LEAD_TIME
             finger.wait_for(lambda: finger.newest().time > start)
