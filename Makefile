@@ -1,6 +1,7 @@
 # Every target makes the environment it needs first (tools/bootstrap.sh), in .venv, build/ and install/ of this checkout.
 SHELL := /bin/bash
 RUN := . ./setup.bash &&
+TESTS := -m pytest -n 2 --dist loadfile
 
 .PHONY: help env demo paper figures sensorless servo grasp bench test lint coverage faults docs clean distclean
 
@@ -45,7 +46,7 @@ bench: env
 	$(RUN) python bench/run.py --out out/bench.json
 
 test: lint
-	$(RUN) python -m pytest -n 2 --dist loadfile
+	$(RUN) python $(TESTS)
 
 lint: env
 	$(RUN) ruff check . && ruff format --check . && mypy
@@ -54,7 +55,7 @@ faults: env
 	$(RUN) python test/faults.py
 
 coverage: env
-	$(RUN) coverage erase && coverage run -m pytest -n 2 --dist loadfile && coverage combine --quiet && coverage report
+	$(RUN) coverage erase && coverage run $(TESTS) && coverage combine --quiet && coverage report
 
 docs: env build/docs/installed
 	$(RUN) PYTHONPATH=build/docs:$$PYTHONPATH python -m sphinx -W --keep-going --quiet docs out/docs

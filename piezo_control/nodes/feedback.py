@@ -77,9 +77,8 @@ class FeedbackNode(BlockNode):
         self.dynamics: DynamicsParameters | None = None
         self._undoes_temperature = True  # the feedforward, as long as none says that it does not
         self.create_subscription(Dynamics, "dynamics", self._on_dynamics, LATCHED)
-        self._is_held = (
-            False  # the finger, where the last answer left it, while this node is inactive
-        )
+        self._is_held = False
+        """Whether the finger is where the last answer left it, while this node is inactive."""
         self._file = ""
         self._loading = False
         self._take_file()

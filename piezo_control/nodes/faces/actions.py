@@ -22,9 +22,8 @@ from piezo_gripper_msgs.action import Grip
 if TYPE_CHECKING:
     from piezo_control.nodes.gripper import GripperNode
 
-ON_ITS_WAY = (
-    1.0  # s: what a server has sent is lost when its program ends before a busy client has read it
-)
+# What a server has sent is lost when its program ends before a busy client has read it.
+ON_ITS_WAY = 1.0  # s
 
 
 class DeferredActionServer(ActionServer):
