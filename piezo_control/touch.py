@@ -15,15 +15,16 @@ Of what is missing, the models may be off by two parts, `zero` = `share` + `drif
 - `drift` with time: slowly, and not while the reference closes, when a rise may be an object.
 
 Both follow without a bound where something pulls, on the way and at rest, which no object does here (an adhesive one
-would be felt late), but no faster than a vibration, of which they would take one half only.
+would be felt late), but no faster than a vibration, of which they would take one half only. What they learned since
+nothing pushed last was the object: they give it back when that is felt.
 
-What the models are off by on the way in contact is the error of the push; an object so soft that a tip loses less than
-`model_error` of its way on it is not felt.
+What the models are off by on the way in contact is the error of the push, for which a share of what is allowed is left
+free; an object so soft that a tip loses less than `model_error` of its way on it is not felt.
 
 The command integrates the slower of two wishes, to follow the reference and to push with `max_force`:
 
     command' = min(reference' + position_rate lowpass(reference - deflection),
-                   force_rate s_p (max_force - push)),
+                   force_rate s_p ((1 - force_margin) max_force - push)),
 
 and opens no faster than force_rate s_p force_limit, so that a reference that jumps does not make it ring.
 There is one integrator, so one wish takes over from the other without a bump, and a finger comes no faster than
@@ -83,6 +84,10 @@ class TouchParameters:
     zero_time: float = parameter(
         10.0, "time constant with which such drift is learned", unit="s", low=1e-2, high=1e6
     )
+    force_margin: float = parameter(
+        0.03, "share of the allowed force that is left free, as the told one may be too small by it",
+        low=0.0, high=0.5,
+    )  # fmt: skip
 
 
 class TouchCoefficients(NamedTuple):
@@ -97,6 +102,7 @@ class TouchCoefficients(NamedTuple):
     zero_rate: float
     pull_rate: float
     closing_rate: float
+    aim: float  # share of the allowed force that it pushes with
     opening: float  # m, the most that it opens by
     command_low: float
     command_high: float
@@ -109,6 +115,7 @@ class TouchState(NamedTuple):
     behind: list[float]  # reference - deflection (m), once and twice low-passed
     share: list[float]  # m
     drift: list[float]  # m
+    clear: list[float]  # `share` and `drift` when nothing pushed last
     way: list[float]  # the command (m) behind a play
     heading: list[float]  # 1 or -1, where the way went last; 0: nowhere yet
     turns: list[float]  # where the way (m) turned, a loop within the other
@@ -146,6 +153,7 @@ def touch_coefficients(
         sample_time / p.zero_time,
         sample_time / (PULL_TIME + sample_time),
         sample_time / (CLOSING_TIME + sample_time),
+        1.0 - p.force_margin,
         p.force_rate * sample_time * elastic_constant * p.force_limit,
         command_low,
         command_high,
@@ -159,6 +167,7 @@ def touch_rest() -> TouchState:
         behind=[0.0, 0.0],
         share=[0.0],
         drift=[0.0],
+        clear=[0.0, 0.0],
         way=[0.0],
         heading=[0.0],
         turns=[0.0] * LOOPS,
@@ -175,8 +184,8 @@ def touch_rest() -> TouchState:
 
 def touch_start(s: TouchState, command: float, deflection: float, expected: float) -> None:
     """Let a tip that nobody pushes begin at a `command` (m), its reference where it is (m)."""
-    s.missing[0] = s.missing[1] = s.drift[0] = expected - deflection
-    s.share[0] = s.heading[0] = s.depth[0] = 0.0
+    s.missing[0] = s.missing[1] = s.drift[0] = s.clear[1] = expected - deflection
+    s.share[0] = s.clear[0] = s.heading[0] = s.depth[0] = 0.0
     s.behind[0] = s.behind[1] = 0.0
     s.way[0] = s.command[0] = command
     s.mean[0] = s.mean[1] = s.reference[0] = deflection
@@ -239,8 +248,14 @@ def feel(
     is_felt = push >= min(c.touch, 0.5 * c.elastic_constant * max_force)
     learned = 0.0 if is_felt else min(max(push, -trust), trust)
     s.share[0] = min(s.share[0] + learned, bound)
-    if not is_felt:
+    if is_felt:
+        s.share[0] = min(s.share[0], s.clear[0])
+        s.drift[0] = min(s.drift[0], s.clear[1])
+    else:
         push = missing_to(s)
+        if push <= 0.0:
+            s.clear[0] = s.share[0]
+            s.clear[1] = s.drift[0]
         if push < 0.0:
             part = s.share if trust > 0.0 else s.drift
             part[0] += c.pull_rate * push
@@ -256,7 +271,7 @@ def press(
     low_pass(s.mean, c.closing_rate, reference)
     ahead = reference - s.reference[0] + c.position_rate * s.behind[1]
     s.reference[0] = reference
-    push = c.force_rate * c.elastic_constant * (max_force - push_of(c, s))
+    push = c.force_rate * c.elastic_constant * (c.aim * max_force - push_of(c, s))
     retreat = c.force_rate * max(c.elastic_constant * max_force, c.touch)
     change = max(min(max(ahead, -retreat), push), -c.opening)
     command = min(max(s.command[0] + change, c.command_low), c.command_high)

@@ -99,7 +99,7 @@ def test_the_law_gives_the_samples_of_the_engine():
     np.testing.assert_allclose(bench.voltages, expected.voltage, rtol=0, atol=1e-6)
     np.testing.assert_allclose(bench.pushes, push, rtol=0, atol=1e-9)
     assert bench.watch.phase[0] == NORMAL
-    assert -bench.plant.tip_force == pytest.approx(LIMIT, rel=0.03)
+    assert -bench.plant.tip_force == pytest.approx((1.0 - DEFAULTS.force_margin) * LIMIT, rel=0.03)
 
 
 def test_after_a_fault_the_force_is_met_anew():
@@ -175,7 +175,7 @@ def test_the_force_is_told_by_the_elastic_constant_of_the_feedforwards_file(tmp_
         8000,
     )
     assert np.max(-run.total_force) < 1.1 * LIMIT
-    assert push[-1] == pytest.approx(LIMIT, rel=0.02)
+    assert push[-1] == pytest.approx((1.0 - DEFAULTS.force_margin) * LIMIT, rel=0.02)
 
 
 @pytest.mark.parametrize(
