@@ -440,6 +440,7 @@ def test_cantilever_asks_again_ignores_duplicates_and_stops_at_0_v(neighbour, tm
     assert len(set(repeated)) == 1
     state = states[-1]
     assert (state.samples, state.voltage) == (2, 0.0)
+    assert state.deflection != deflections[-1].value  # it tells where the way to rest has led
     assert state.asked_again >= 2
     assert re.match(r"no answer to sample 2 .*'/command' or '/voltage'", state.text)
 

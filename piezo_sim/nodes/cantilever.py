@@ -407,6 +407,7 @@ class CantileverNode(FingerNode):
         while ending.phase == RAMPING:
             voltage = ending.voltage(within, voltage, h)
             self.plant.advance(voltage, self.temperature, 0.0)
+        self.sample.value = self.plant.measure()
         self._enter(phase, text)
 
     def _enter(self, phase: int, text: str = "") -> None:
