@@ -192,15 +192,21 @@ def test_a_reference_that_shakes_or_creeps_passes_no_limit(
 def test_a_random_walk_strikes_no_blows_on_a_hard_wall():
     """Opening faster than it closes sets a finger ringing: the wall was hit with six times the limit."""
     every = 5  # samples, white noise behind a low-pass of 20 Hz
-    walk, kept = [0.0], math.exp(-2.0 * math.pi * 20.0 * every * H)
-    for step in np.random.default_rng(3).standard_normal(20000):
-        walk.append(kept * walk[-1] + 0.5e-6 * math.sqrt(1.0 - kept**2) * step)
-    walk = np.interp(np.arange(100000), every * np.arange(len(walk)), walk)
-    force, _ = press(6e-6 + walk, ContactParameters(1e5, 0.05, AWAY))
-    # A tip of modal mass a2 / s_p that meets a spring k at v; ringing brings it at twice the command's speed.
+    kept = math.exp(-2.0 * math.pi * 20.0 * every * H)
+    strongest = []
+    for seed in range(3, 12):
+        walk = [0.0]
+        for step in np.random.default_rng(seed).standard_normal(20000):
+            walk.append(kept * walk[-1] + 0.5e-6 * math.sqrt(1.0 - kept**2) * step)
+        walk = np.interp(np.arange(100000), every * np.arange(len(walk)), walk)
+        force, _ = press(6e-6 + walk, ContactParameters(1e5, 0.05, AWAY))
+        strongest.append(force.max())
+    # A tip of modal mass a2 / s_p that meets a spring k at v; ringing brings it at twice the command's speed, and
+    # at more where it was set ringing by several turns of the walk.
     speed = 2.1 * DEFAULTS.force_rate * ELASTIC * LIMIT
     blow = speed * math.sqrt(1e5 * DynamicsParameters().denominator[0] / ELASTIC)
-    assert 0.9 * LIMIT < force.max() < LIMIT + blow
+    assert 0.9 * LIMIT < np.median(strongest) < LIMIT + blow
+    assert max(strongest) < LIMIT + 2.0 * blow
 
 
 def test_a_limit_below_the_least_that_is_felt_is_no_drift():
@@ -301,4 +307,4 @@ def test_the_finger_never_asks_for_more_than_its_own_limit():
     for _ in range(100):
         commands = low.step(20e-6, 0.0, 0.0, math.inf), high.step(20e-6, 0.0, 0.0, 1e-4)
         assert commands[0] == commands[1]
-    assert commands[0] == pytest.approx(100 * DEFAULTS.force_rate * H * ELASTIC * 1e-4)
+    assert commands[0] == pytest.approx(100 * DEFAULTS.force_rate * H * ELASTIC * AIM * 1e-4)
