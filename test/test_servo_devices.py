@@ -179,6 +179,21 @@ def test_a_voltage_that_the_card_does_not_take_is_told_and_leaves_no_leap(
     assert card.device.output[0] == 0.0
 
 
+@pytest.mark.parametrize("answer", [NONE_IN_TIME, FAILED])
+def test_a_card_that_comes_back_is_led_to_rest_from_where_it_went_meanwhile(at_20_volts, answer):
+    """To rest by itself, as hardware has to; the first voltage that it took again was 19 V."""
+    servo, card = at_20_volts
+    before = int(card.device.count[0])
+    card.device.answer[0] = answer
+    wait(lambda: servo.phase == RAMPING)
+    card.device.output[0] = 0.0
+    number = servo.number
+    wait(lambda: servo.number > number + 2.0 * servo.parameters.hold_time / SLOW)
+    card.device.answer[0] = FRESH
+    wait(lambda: servo.phase == FAULT)
+    assert (card.voltages[before + 1 :] == 0.0).all()  # one may have been on its way
+
+
 def test_a_voltage_that_is_not_taken_once_is_bridged():
     settings = settings_of(PATIENT, STRAIGHT, SLOW)
     laws, watch = laws_of(OPEN_LOOP, Feedforward(STRAIGHT, SLOW)), watch_at_rest()

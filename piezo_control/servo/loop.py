@@ -116,9 +116,9 @@ def run(loop: Loop, device: Any) -> bool:
 
     A device that takes no voltage ends it too, after the hold time. `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
 
-    Returns True where it stood still for the hold time and a period, as on a machine that stops the whole process:
-    the hardware's own watchdog may have acted, and the voltage that was due does not go out before somebody has looked
-    where the finger is.
+    Returns True where no voltage went out for the hold time and a period, as on a machine that stops the whole process
+    or of a card that takes none: the hardware's own watchdog may have acted, and the voltage that is due does not go out
+    before somebody has looked where the finger is.
     """
     clock = loop.clock
     resets = loop.orders.reset[0]
@@ -149,7 +149,8 @@ def run(loop: Loop, device: Any) -> bool:
                 return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
-            put_out = now(clock)
+            if written == FRESH:
+                put_out = now(clock)
             judge_write(loop.settings, loop.laws, loop.watch, written, before)
         status = read(device, clock.edge[0])
         # The output moves somewhere between call and return of `write`. The next one is called no sooner than this.
@@ -165,7 +166,8 @@ def run(loop: Loop, device: Any) -> bool:
                 return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
-            put_out = now(clock)
+            if written == FRESH:
+                put_out = now(clock)
             judge_write(loop.settings, loop.laws, loop.watch, written, before)
     if loop.at_next_edge:
         follow(loop.laws, before)  # what was to go out next never does

@@ -42,7 +42,7 @@ piezo_device *piezo_open(const char *options, double sample_time, char *error, s
 
 /* May be left out. Puts what the output puts out now, in the card's unit, into `voltage` and returns PIEZO_FRESH; any
  * other value says that the card cannot tell. Never called between two samples, but after piezo_open, when the loop begins,
- * and where it stood still so long that the hardware may have gone to rest by itself. From there the servo leads the
+ * and where no voltage went out for so long that the hardware may have gone to rest by itself. From there the servo leads the
  * voltage to rest. The output of a card that does not tell must be at rest already, or it leaps there. */
 int piezo_applied(piezo_device *device, double *voltage);
 
