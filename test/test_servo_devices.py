@@ -23,7 +23,7 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes import servo as servo_node
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.nodes.servo import ServoNode
-from piezo_control.parameters import dump
+from piezo_control.parameters import ParameterError, dump
 from piezo_control.profile import Profile
 from piezo_control.safety import (
     FAULT,
@@ -485,8 +485,8 @@ def test_a_step_without_a_reading_is_told():
 def bench_on(card, monkeypatch, **limits):
     monkeypatch.setattr(commission, "open_driver", lambda *_: card)
     arguments = argparse.Namespace(
-        sample_time=SLOW, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, driver="board",
-        driver_options="", priority=0, share=0.1,
+        sample_time=SLOW, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, card_low=0.0, card_high=0.0,
+        driver="board", driver_options="", priority=0, share=0.1,
     )  # fmt: skip
     return commission.Bench(arguments, VoltageParameters(**limits), 1.0)
 
@@ -499,7 +499,7 @@ def test_commission_asks_before_anything_moves(monkeypatch, says, told):
     card, asked = Card(12.0, says), []
     bench = bench_on(card, monkeypatch, voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     assert commission.commission(bench, None, asked.append) is None
-    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest"
+    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest, of an unknown range"
     assert asked == [f"within {span}; to rest at 75 V ({told})?"]
     assert card.closed and not len(card.voltages)
 
@@ -584,8 +584,32 @@ def test_what_the_card_is_going_to_put_out_is_said_in_its_unit():
     stack = VoltageParameters(voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     millivolts = ServoParameters(amplifier_gain=0.05, amplifier_zero=2048.0)
     assert millivolts.span(stack) == (
-        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest"
+        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest, of an unknown range"
     )
+
+
+@pytest.mark.parametrize(
+    "gain, zero, is_right",
+    [(20.0, 0.0, True), (-20.0, 0.0, True), (0.02, 0.0, False), (20.0, 2048.0, False)],
+)
+def test_a_scale_that_asks_more_of_the_card_than_it_has_is_refused(
+    monkeypatch, gain, zero, is_right
+):
+    """A card of ±10 V before an amplifier of 20 V per V; ±40 V at the finger are ±2 V there."""
+    scales = {"amplifier_gain": gain, "amplifier_zero": zero, "card_low": -10.0, "card_high": 10.0}
+    card = Card()
+    bench = bench_on(card, monkeypatch)
+    vars(bench.arguments).update(scales)
+    if is_right:
+        assert servo_on(card, **scales).voltage == 0.0
+        assert commission.commission(bench, None, lambda _: False) is None
+        return
+    text = "must be within 'card_low' and 'card_high': is 'amplifier_gain'"
+    with pytest.raises(ParameterError, match=text):
+        servo_on(card, **scales)
+    with pytest.raises(ParameterError, match="of -10 to 10, " + text):
+        commission.commission(bench, None, lambda _: pytest.fail("nobody is asked"))
+    assert not len(card.voltages)
 
 
 def test_limits_that_nobody_gave_are_warned_of(node, capfd):
@@ -696,3 +720,28 @@ def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):
     )
     assert node.heard[-1].voltage == pytest.approx(node.card.device.output[0], abs=1e-9)
     assert node.report()[0] == node.heard[-1].text
+
+
+@pytest.mark.parametrize("says", [True, False])
+def test_a_finger_that_was_left_somewhere_is_not_taken_to_be_at_rest(node, says):
+    """Whether its hardware went to rest by itself only the driver or somebody who looks can tell; it leaped by 20 V."""
+    node.card = Card(0.0, says)
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node.servo.refer(Profile([0.0], [5e-6]))
+    node.until(lambda state: state.voltage > 1.0)
+    node.card.device.answer[0] = FAILED
+    node.trigger_deactivate()
+    node.until(lambda state: state.phase == FingerState.IDLE)
+    left = float(node.card.device.output[0])
+    node.card.device.answer[0] = FRESH
+    if says:
+        assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        assert node.servo.begins_at == pytest.approx(left)
+        return
+    assert node.trigger_activate() == TransitionCallbackReturn.FAILURE
+    assert node.card.closed == 2 and node.card.device.output[0] == left
+    assert "left at" in node.report()[0]
+    node.card.device.output[0] = 0.0
+    node.reset()
+    assert node.report()[0] == ""
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS

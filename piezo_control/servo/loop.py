@@ -250,7 +250,7 @@ class Servo:
     stands_at : float, optional
         What a card whose driver does not say it puts out, in its unit, as far as the caller knows; NaN: nobody does.
 
-    Raises ParameterError for a controller that does not fit, DriverError for a card that puts out what it cannot.
+    Raises ParameterError for a controller that does not fit or voltages that the card cannot put out, DriverError for a card that puts out what it cannot.
 
     Attributes
     ----------
@@ -271,6 +271,7 @@ class Servo:
         feeling: Feeling | None = None,
         stands_at: float = math.nan,
     ) -> None:
+        parameters.check_output(feedforward)
         self.driver = driver
         self.parameters = parameters
         self.feedback = feedback
