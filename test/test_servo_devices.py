@@ -327,6 +327,24 @@ def test_a_finger_says_what_it_puts_out_until_it_rests():
     assert (report.own_ramps, report.samples, report.refused_datagrams) == (1, 1, 0)
 
 
+def test_a_finger_makes_no_step_of_datagrams_that_were_lost():
+    """1e3 V/s, samples of 0.1 ms; the voltage that arrives after a gap is 20 V away."""
+    plant = CantileverParameters(amplifier=AmplifierParameters(slew_limit=1e3))
+    finger = UdpFinger(plant, safety=SafetyParameters(hold_time=10.0))
+    finger.start()
+    udp = SharedLibrary("udp", f"127.0.0.1:{finger.port}", SLOW)
+    try:
+        ctypes.CDLL(str(library("udp"))).piezo_write(
+            ctypes.c_void_p(udp.device.device), ctypes.c_double(20.0)
+        )
+        wait(lambda: applied(udp, 1.0, 0.0) == 20.0)
+    finally:
+        udp.close()
+        report = finger.stop()
+    assert report.largest_step == 20.0
+    assert report.largest_output_step == pytest.approx(0.1)
+
+
 def test_a_servo_of_another_rest_than_the_finger_leads_it_there():
     finger = UdpFinger(CantileverParameters())
     finger.start()
