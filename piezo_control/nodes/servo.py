@@ -218,7 +218,7 @@ class ServoNode(FingerNode):
             self.get_logger().info(words)
         else:
             self.get_logger().warning(
-                f"{words}, the limits of the paper's finger: what yours stands belongs into a 'feedforward_file'"
+                f"{words}; the limits are those of the paper's finger: what yours stands belongs into a 'feedforward_file'"
             )
 
     def _say_where_it_begins(self, voltage: float, rest: float) -> None:
