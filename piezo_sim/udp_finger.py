@@ -2,7 +2,8 @@
 """A finger at the other end of the servo's `udp` driver: a simulated piezocantilever in real time.
 
 Every datagram brings a voltage, which is held from then on, and is answered with the deflection measured just
-before. Without a voltage for the hold time the finger ramps itself to rest, as the hardware of a real one must.
+before. Without a voltage for the hold time the finger ramps itself to rest, and the amplifier goes from one voltage to
+the next within a slew limit of its own, sample by sample, as the hardware of a real one must: lost datagrams end in no step.
 Whoever asks hears what voltage is on.
 Whoever sends the first one leads the finger until it lets go or is silent for the hold time, and its numbers rise;
 others are named, told so and not acted upon.
@@ -28,7 +29,7 @@ from piezo_control.compiled import compiled
 from piezo_control.files import write_json
 from piezo_control.options import output_file, port, within
 from piezo_control.parameters import ParameterError, build, load
-from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
+from piezo_control.safety import RAMP_PERIOD, SafetyParameters, VoltageParameters, toward
 from piezo_control.servo.clock import Clock, become_real_time, clock_of, now
 from piezo_control.start import stop_at_signals
 from piezo_sim.driver import Device, device_of, read, write
@@ -36,6 +37,9 @@ from piezo_sim.plant.cantilever import CantileverParameters
 
 PORT = 9750
 WORD, ASKS = struct.unpack("<qq", b"PZG1\0\0\0\0PZG?\0\0\0\0")
+CARD = {
+    "amplifier.slew_limit": VoltageParameters().slew_limit
+}  # of a cantilever's file that has none
 SIZE = 24  # bytes of a datagram: word, number, value
 
 _recvfrom: Any = types.ExternalFunction(
@@ -69,6 +73,7 @@ class Seen(NamedTuple):
     lowest: np.ndarray
     highest: np.ndarray
     step: np.ndarray  # largest change from one voltage to the next
+    output_step: np.ndarray  # largest change of the amplifier in a sample of the plant
     number: np.ndarray
     ramps: np.ndarray  # how often nothing came for the hold time
     refused: np.ndarray  # datagrams of others, and of numbers that do not rise
@@ -83,6 +88,7 @@ class Report:
     lowest_voltage: float
     highest_voltage: float
     largest_step: float
+    largest_output_step: float
     last_voltage: float
     own_ramps: int
     refused_datagrams: int
@@ -92,8 +98,9 @@ def serve(
     line: Line, device: Device, clock: Clock, seen: Seen, hold: int, step: float, stop: np.ndarray
 ) -> None:
     """Answer datagrams until `stop`; after `hold` ns without one go `step` (V) per ramp period to rest."""
-    heard = ramped = now(clock)
+    heard = ramped = reached = now(clock)
     rest = device.plant.amplifier.rest
+    output = device.state.amplifier.voltage
     while stop[0] == 0:
         line.length[0] = 128
         size = _recvfrom(
@@ -101,7 +108,11 @@ def serve(
             line.length.ctypes.data,
         )  # fmt: skip
         instant = now(clock)
-        read(device, instant)
+        while reached < instant:
+            reached = min(reached + device.period, instant)
+            before = output[0]
+            read(device, reached)
+            seen.output_step[0] = max(seen.output_step[0], abs(output[0] - before))
         if size == SIZE and line.integers[0] == WORD:
             voltage = line.floats[2]
             number = line.integers[1]
@@ -133,7 +144,7 @@ def serve(
             write(device, voltage, instant)
             continue
         if size == SIZE and line.integers[0] == ASKS:
-            line.floats[2] = device.demand[0]
+            line.floats[2] = output[0]
             answer(line)
         # In time, however often somebody asks meanwhile.
         share = min(1.0, (instant - ramped) * 1e-9 / RAMP_PERIOD)
@@ -221,6 +232,7 @@ class UdpFinger:
             lowest_voltage=float(seen.lowest[0]),
             highest_voltage=float(seen.highest[0]),
             largest_step=float(seen.step[0]),
+            largest_output_step=float(seen.output_step[0]),
             last_voltage=float(self._device.written[0]),
             own_ramps=int(seen.ramps[0]),
             refused_datagrams=int(seen.refused[0]),
@@ -253,16 +265,14 @@ def main() -> int:
     arguments = parser.parse_args()
     stop = stop_at_signals()
     try:
-        plant = CantileverParameters()
         if not (
             math.isfinite(arguments.scale) and arguments.scale and math.isfinite(arguments.zero)
         ):
             raise ParameterError(
                 f"--scale is {arguments.scale:g}, must be finite and not 0; --zero is {arguments.zero:g}, must be finite"
             )
-        if arguments.cantilever:
-            values = load(arguments.cantilever, "cantilever")
-            plant = build(CantileverParameters, values, arguments.cantilever)
+        file = arguments.cantilever
+        plant = build(CantileverParameters, CARD | (load(file, "cantilever") if file else {}), file)
         finger = UdpFinger(
             plant, arguments.host, arguments.port, None, arguments.priority, arguments.scale,
             arguments.zero,

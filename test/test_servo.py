@@ -420,7 +420,7 @@ def test_a_signal_in_the_midst_of_commissioning_ends_at_rest(monkeypatch):
     monkeypatch.setattr(commission, "Servo", Seen)
     arguments = argparse.Namespace(
         sample_time=H, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, driver="simulated", driver_options="",
-        priority=0,
+        priority=0, card_low=0.0, card_high=0.0,
     )  # fmt: skip
     bench = commission.Bench(arguments, VoltageParameters(), 1.0)
     before = {number: signal.getsignal(number) for number in ENDING}

@@ -23,7 +23,7 @@ from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.nodes import servo as servo_node
 from piezo_control.nodes.qos import LATCHED
 from piezo_control.nodes.servo import ServoNode
-from piezo_control.parameters import dump
+from piezo_control.parameters import ParameterError, dump
 from piezo_control.profile import Profile
 from piezo_control.safety import (
     FAULT,
@@ -179,6 +179,21 @@ def test_a_voltage_that_the_card_does_not_take_is_told_and_leaves_no_leap(
     assert card.device.output[0] == 0.0
 
 
+@pytest.mark.parametrize("answer", [NONE_IN_TIME, FAILED])
+def test_a_card_that_comes_back_is_led_to_rest_from_where_it_went_meanwhile(at_20_volts, answer):
+    """To rest by itself, as hardware has to; the first voltage that it took again was 19 V."""
+    servo, card = at_20_volts
+    before = int(card.device.count[0])
+    card.device.answer[0] = answer
+    wait(lambda: servo.phase == RAMPING)
+    card.device.output[0] = 0.0
+    number = servo.number
+    wait(lambda: servo.number > number + 2.0 * servo.parameters.hold_time / SLOW)
+    card.device.answer[0] = FRESH
+    wait(lambda: servo.phase == FAULT)
+    assert (card.voltages[before + 1 :] == 0.0).all()  # one may have been on its way
+
+
 def test_a_voltage_that_is_not_taken_once_is_bridged():
     settings = settings_of(PATIENT, STRAIGHT, SLOW)
     laws, watch = laws_of(OPEN_LOOP, Feedforward(STRAIGHT, SLOW)), watch_at_rest()
@@ -310,6 +325,24 @@ def test_a_finger_says_what_it_puts_out_until_it_rests():
         udp.close()
         report = finger.stop()
     assert (report.own_ramps, report.samples, report.refused_datagrams) == (1, 1, 0)
+
+
+def test_a_finger_makes_no_step_of_datagrams_that_were_lost():
+    """1e3 V/s, samples of 0.1 ms; the voltage that arrives after a gap is 20 V away."""
+    plant = CantileverParameters(amplifier=AmplifierParameters(slew_limit=1e3))
+    finger = UdpFinger(plant, safety=SafetyParameters(hold_time=10.0))
+    finger.start()
+    udp = SharedLibrary("udp", f"127.0.0.1:{finger.port}", SLOW)
+    try:
+        ctypes.CDLL(str(library("udp"))).piezo_write(
+            ctypes.c_void_p(udp.device.device), ctypes.c_double(20.0)
+        )
+        wait(lambda: applied(udp, 1.0, 0.0) == 20.0)
+    finally:
+        udp.close()
+        report = finger.stop()
+    assert report.largest_step == 20.0
+    assert report.largest_output_step == pytest.approx(0.1)
 
 
 def test_a_servo_of_another_rest_than_the_finger_leads_it_there():
@@ -470,8 +503,8 @@ def test_a_step_without_a_reading_is_told():
 def bench_on(card, monkeypatch, **limits):
     monkeypatch.setattr(commission, "open_driver", lambda *_: card)
     arguments = argparse.Namespace(
-        sample_time=SLOW, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, driver="board",
-        driver_options="", priority=0, share=0.1,
+        sample_time=SLOW, write="immediately", amplifier_gain=1.0, amplifier_zero=0.0, card_low=0.0, card_high=0.0,
+        driver="board", driver_options="", priority=0, share=0.1,
     )  # fmt: skip
     return commission.Bench(arguments, VoltageParameters(**limits), 1.0)
 
@@ -484,7 +517,7 @@ def test_commission_asks_before_anything_moves(monkeypatch, says, told):
     card, asked = Card(12.0, says), []
     bench = bench_on(card, monkeypatch, voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     assert commission.commission(bench, None, asked.append) is None
-    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest"
+    span = "0 to 150 V, 75 V at rest; the card puts out 0 to 150, 75 at rest, of an unknown range"
     assert asked == [f"within {span}; to rest at 75 V ({told})?"]
     assert card.closed and not len(card.voltages)
 
@@ -569,8 +602,32 @@ def test_what_the_card_is_going_to_put_out_is_said_in_its_unit():
     stack = VoltageParameters(voltage_low=0.0, voltage_high=150.0, rest_voltage=75.0)
     millivolts = ServoParameters(amplifier_gain=0.05, amplifier_zero=2048.0)
     assert millivolts.span(stack) == (
-        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest"
+        "0 to 150 V, 75 V at rest; the card puts out 2048 to 5048, 3548 at rest, of an unknown range"
     )
+
+
+@pytest.mark.parametrize(
+    "gain, zero, is_right",
+    [(20.0, 0.0, True), (-20.0, 0.0, True), (0.02, 0.0, False), (20.0, 2048.0, False)],
+)
+def test_a_scale_that_asks_more_of_the_card_than_it_has_is_refused(
+    monkeypatch, gain, zero, is_right
+):
+    """A card of ±10 V before an amplifier of 20 V per V; ±40 V at the finger are ±2 V there."""
+    scales = {"amplifier_gain": gain, "amplifier_zero": zero, "card_low": -10.0, "card_high": 10.0}
+    card = Card()
+    bench = bench_on(card, monkeypatch)
+    vars(bench.arguments).update(scales)
+    if is_right:
+        assert servo_on(card, **scales).voltage == 0.0
+        assert commission.commission(bench, None, lambda _: False) is None
+        return
+    text = "must be within 'card_low' and 'card_high': is 'amplifier_gain'"
+    with pytest.raises(ParameterError, match=text):
+        servo_on(card, **scales)
+    with pytest.raises(ParameterError, match="of -10 to 10, " + text):
+        commission.commission(bench, None, lambda _: pytest.fail("nobody is asked"))
+    assert not len(card.voltages)
 
 
 def test_limits_that_nobody_gave_are_warned_of(node, capfd):
@@ -681,3 +738,28 @@ def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):
     )
     assert node.heard[-1].voltage == pytest.approx(node.card.device.output[0], abs=1e-9)
     assert node.report()[0] == node.heard[-1].text
+
+
+@pytest.mark.parametrize("says", [True, False])
+def test_a_finger_that_was_left_somewhere_is_not_taken_to_be_at_rest(node, says):
+    """Whether its hardware went to rest by itself only the driver or somebody who looks can tell; it leaped by 20 V."""
+    node.card = Card(0.0, says)
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    node.servo.refer(Profile([0.0], [5e-6]))
+    node.until(lambda state: state.voltage > 1.0)
+    node.card.device.answer[0] = FAILED
+    node.trigger_deactivate()
+    node.until(lambda state: state.phase == FingerState.IDLE)
+    left = float(node.card.device.output[0])
+    node.card.device.answer[0] = FRESH
+    if says:
+        assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        assert node.servo.begins_at == pytest.approx(left)
+        return
+    assert node.trigger_activate() == TransitionCallbackReturn.FAILURE
+    assert node.card.closed == 2 and node.card.device.output[0] == left
+    assert "left at" in node.report()[0]
+    node.card.device.output[0] = 0.0
+    node.reset()
+    assert node.report()[0] == ""
+    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS

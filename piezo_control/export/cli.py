@@ -72,6 +72,7 @@ def make(arguments: argparse.Namespace) -> dict[str, str]:
             f"{controller.sample_time:g} s"
         )
     check_delay(controller, p)
+    p.check_output(feedforward)
     found = objections(controller, feedforward, feedforward.dynamics.denominator)
     if found and not arguments.force:
         raise ParameterError(

@@ -159,19 +159,26 @@ class ServoNode(FingerNode):
             check_force(p, feedforward, controller.sample_time)
             feeling = feeling_of(p.touch, feedforward, controller, p.thermometer.degc_at_start)
         *card, stands_at = self._rested
-        if card != [p.driver, p.driver_options]:
+        is_same = card == [p.driver, p.driver_options]
+        was_left = self._left if is_same else ""
+        if was_left or not is_same:
             stands_at = math.nan
         try:
             driver = open_driver(p.driver, p.driver_options, controller.sample_time)
         except DriverError as error:
             raise ValueError(str(error)) from None
         try:
-            self.servo = Servo(
+            servo = Servo(
                 driver, p, controller, feedforward, p.priority, p.cpu, p.spin, feeling, stands_at
             )
+            if was_left and math.isnan(servo.begins_at):
+                raise ParameterError(
+                    f"{was_left}; the driver does not say where it is now: bring the card to rest, then reset this"
+                )
         except (ParameterError, DriverError) as error:
             driver.close()
             raise ValueError(str(error)) from None
+        self.servo, self._left = servo, ""
         self._say_limits(feedforward)
         self._say_where_it_begins(self.servo.begins_at, feedforward.rest)
         if p.force_control:
@@ -211,7 +218,7 @@ class ServoNode(FingerNode):
             self.get_logger().info(words)
         else:
             self.get_logger().warning(
-                f"{words}, the limits of the paper's finger: what yours stands belongs into a 'feedforward_file'"
+                f"{words}; the limits are those of the paper's finger: what yours stands belongs into a 'feedforward_file'"
             )
 
     def _say_where_it_begins(self, voltage: float, rest: float) -> None:
@@ -265,6 +272,8 @@ class ServoNode(FingerNode):
             self.thermometer.check()  # it would move the finger until the fault comes back
         if self.servo:
             self.servo.reset()
+        else:
+            self._left = ""  # somebody has looked after the card
 
     def report(self) -> tuple[str, dict[str, Any]]:
         s = self.servo

@@ -99,6 +99,7 @@ class Bench:
         card = {
             "write": a.write, "sensor_scale": self.scale, "sensor_zero": self.zero,
             "amplifier_gain": a.amplifier_gain, "amplifier_zero": a.amplifier_zero,
+            "card_low": a.card_low, "card_high": a.card_high,
         }  # fmt: skip
         return build(ServoParameters, card)
 
@@ -269,6 +270,7 @@ def commission(
     low, high, home = bench.limits.voltage_low, bench.limits.voltage_high, bench.limits.rest
     reach = max(home - low, high - home)
     side = 1.0 if high - home >= home - low else -1.0
+    bench.card.check_output(bench.limits)
     now = bench.applied()
     says = (
         "the driver does not say what the card puts out" if math.isnan(now) else f"from {now:.3g} V"
@@ -379,6 +381,8 @@ def commission(
         "frozen_voltage": FROZEN_VOLTAGE * (high - low),
         "amplifier_gain": a.amplifier_gain,
         "amplifier_zero": a.amplifier_zero,
+        "card_low": a.card_low,
+        "card_high": a.card_high,
         "controller_file": str((folder / "feedback.yaml").resolve()),
         "feedforward_file": str((folder / "feedforward.yaml").resolve()),
     }
@@ -476,6 +480,11 @@ def parse() -> argparse.Namespace:
         "--amplifier-zero", type=float, default=0.0, metavar="U",
         help="what the card puts out for 0 V at the finger, in its unit (%(default)s)",
     )  # fmt: skip
+    for name in ("card-low", "card-high"):
+        parser.add_argument(
+            f"--{name}", type=float, default=0.0, metavar="U",
+            help="the end of what the card can put out, in its unit; both alike: not known (%(default)s)",
+        )  # fmt: skip
     parser.add_argument(
         "--share",
         type=within(float, 1e-3, 1.0),

@@ -116,9 +116,9 @@ def run(loop: Loop, device: Any) -> bool:
 
     A device that takes no voltage ends it too, after the hold time. `read` and `write` are those of a card; :func:`loop_with` puts those of another driver in their place.
 
-    Returns True where it stood still for the hold time and a period, as on a machine that stops the whole process:
-    the hardware's own watchdog may have acted, and the voltage that was due does not go out before somebody has looked
-    where the finger is.
+    Returns True where no voltage went out for the hold time and a period, as on a machine that stops the whole process
+    or of a card that takes none: the hardware's own watchdog may have acted, and the voltage that is due does not go out
+    before somebody has looked where the finger is.
     """
     clock = loop.clock
     resets = loop.orders.reset[0]
@@ -149,7 +149,8 @@ def run(loop: Loop, device: Any) -> bool:
                 return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
-            put_out = now(clock)
+            if written == FRESH:
+                put_out = now(clock)
             judge_write(loop.settings, loop.laws, loop.watch, written, before)
         status = read(device, clock.edge[0])
         # The output moves somewhere between call and return of `write`. The next one is called no sooner than this.
@@ -165,7 +166,8 @@ def run(loop: Loop, device: Any) -> bool:
                 return True
             out = loop.amplifier_zero + voltage / loop.amplifier_gain
             written = write(device, out, clock.edge[0])
-            put_out = now(clock)
+            if written == FRESH:
+                put_out = now(clock)
             judge_write(loop.settings, loop.laws, loop.watch, written, before)
     if loop.at_next_edge:
         follow(loop.laws, before)  # what was to go out next never does
@@ -248,7 +250,7 @@ class Servo:
     stands_at : float, optional
         What a card whose driver does not say it puts out, in its unit, as far as the caller knows; NaN: nobody does.
 
-    Raises ParameterError for a controller that does not fit, DriverError for a card that puts out what it cannot.
+    Raises ParameterError for a controller that does not fit or voltages that the card cannot put out, DriverError for a card that puts out what it cannot.
 
     Attributes
     ----------
@@ -269,6 +271,7 @@ class Servo:
         feeling: Feeling | None = None,
         stands_at: float = math.nan,
     ) -> None:
+        parameters.check_output(feedforward)
         self.driver = driver
         self.parameters = parameters
         self.feedback = feedback

@@ -46,6 +46,11 @@ class ServoParameters(SafetyParameters):
         0.0,
         "what the card puts out for 0 V at the finger, in its unit, such as the code in the middle",
     )
+    card_low: float = parameter(
+        0.0, "lowest output of the card, in its unit, such as -10 V or code 0; a finger whose limits lie outside is "
+        "refused; as high as 'card_high': not known",
+    )  # fmt: skip
+    card_high: float = parameter(0.0, "highest output of the card, in its unit")
     age_limit: float = parameter(
         1e-2, "a reading older than this is not acted upon", unit="s", low=1e-6, high=10.0
     )
@@ -91,16 +96,36 @@ class ServoParameters(SafetyParameters):
             raise ParameterError(
                 f"'sensor_low' is {self.sensor_low!r} m, must be below 'sensor_high' ({self.sensor_high!r} m)"
             )
+        if self.card_low > self.card_high:
+            raise ParameterError(
+                f"'card_low' is {self.card_low:g}, must be at most 'card_high' ({self.card_high:g})"
+            )
+
+    @property
+    def _knows_card(self) -> bool:
+        return self.card_low < self.card_high
 
     def output(self, voltage: float) -> float:
         """Return what the card puts out, in its unit, for a voltage (V) at the finger."""
         return self.amplifier_zero + voltage / self.amplifier_gain
 
+    def check_output(self, limits: VoltageParameters) -> None:
+        """Raise ParameterError for limits of the voltage that are outside what the card can put out."""
+        out = self.output(limits.voltage_low), self.output(limits.voltage_high)
+        if self._knows_card and not self.card_low <= min(out) <= max(out) <= self.card_high:
+            raise ParameterError(
+                f"the finger gets {self.span(limits)}, must be within 'card_low' and 'card_high': is "
+                f"'amplifier_gain' ({self.amplifier_gain:g} V) or 'amplifier_zero' ({self.amplifier_zero:g}) wrong?"
+            )
+
     def span(self, limits: VoltageParameters) -> str:
         """Say within which voltages a finger stays, and what of the card that is: a scale that is wrong shows there."""
         low, high, home = limits.voltage_low, limits.voltage_high, limits.rest
         out = (self.output(voltage) for voltage in (low, high, home))
+        ends = (
+            f"{self.card_low:g} to {self.card_high:g}" if self._knows_card else "an unknown range"
+        )
         return (
             f"{low:g} to {high:g} V, {home:g} V at rest; the card puts out "
-            "{:g} to {:g}, {:g} at rest".format(*out)
+            "{:g} to {:g}, {:g} at rest, of {}".format(*out, ends)
         )

@@ -411,9 +411,11 @@ class CantileverNode(FingerNode):
         self._enter(phase, text)
 
     def _enter(self, phase: int, text: str = "") -> None:
+        was_held = self.phase == FingerState.HOLDING
         self.phase = phase
         self.text = text
-        if phase in SAID or phase == FingerState.WAITING and text:
+        # A busy machine holds now and then for a few samples, a hundred times a minute, which `state` tells.
+        if phase in SAID and not was_held or phase == FingerState.WAITING and text:
             self.say(f"{PHASES[phase]}, at sample {self.number}" if phase in SAID else text)
         self._publish_state()
 

@@ -42,7 +42,7 @@ piezo_device *piezo_open(const char *options, double sample_time, char *error, s
 
 /* May be left out. Puts what the output puts out now, in the card's unit, into `voltage` and returns PIEZO_FRESH; any
  * other value says that the card cannot tell. Never called between two samples, but after piezo_open, when the loop begins,
- * and where it stood still so long that the hardware may have gone to rest by itself. From there the servo leads the
+ * and where no voltage went out for so long that the hardware may have gone to rest by itself. From there the servo leads the
  * voltage to rest. The output of a card that does not tell must be at rest already, or it leaps there. */
 int piezo_applied(piezo_device *device, double *voltage);
 
@@ -50,7 +50,10 @@ int piezo_applied(piezo_device *device, double *voltage);
 int piezo_read(piezo_device *device, struct piezo_reading *reading);
 
 /* Puts out a voltage, in the card's unit: `amplifier_gain` of the servo is V at the finger per unit, `amplifier_zero`
- * the card's output at 0 V. Where it returns anything but PIEZO_FRESH the output has to be what it was before. */
+ * the card's output at 0 V. Where it returns anything but PIEZO_FRESH the output has to be what it was before.
+ * The servo keeps its limits of voltage and slew in what it hands over here. What is lost behind this call, and a card that
+ * starts again, only the hardware can keep from being a step: in its own timer's interrupt it goes towards the last voltage by no more than
+ * slew limit times period. */
 int piezo_write(piezo_device *device, double voltage);
 
 /* Says what went wrong last; valid until the next call. */

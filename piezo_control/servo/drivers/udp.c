@@ -16,6 +16,9 @@
  * Anybody may ask what the finger puts out: the word "PZG?" in place of "PZG1", and any number; the finger answers with
  * both and the voltage of now, which it neither changes nor holds for that. One that does not know the word gives no
  * answer, and has to be at rest when a servo begins.
+ *
+ * Datagrams get lost, and the voltage after some that were is further away than the servo's slew limit lets it go in a
+ * sample. So the finger keeps that limit itself, in time, on its way to the last voltage that came.
  */
 #define _GNU_SOURCE
 #include "piezo_driver.h"
