@@ -174,15 +174,17 @@ def test_a_feedforward_that_stood_still_does_not_go_on(neighbour, tmp_path):
 
 
 @pytest.mark.shows("a value that is not finite or that no finger reaches")
-@pytest.mark.parametrize("nonsense", [math.nan, 1e30])
-def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, nonsense):
+@pytest.mark.parametrize(
+    ("name", "nonsense"), [("voltage", math.nan), ("voltage", 1e30), ("max_force", -1e-3)]
+)
+def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, name, nonsense):
     with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3):
         voltages = neighbour.listen(Sample, "voltage")
         states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
-        states.publish(FingerState(phase=FingerState.RUNNING, voltage=nonsense))
+        states.publish(FingerState(phase=FingerState.RUNNING, **{name: nonsense}))
         Stream(neighbour, "command", 10e-6)
         neighbour.wait(
-            lambda: f"'state' has a voltage of {nonsense} V" in log(tmp_path, "feedforward")
+            lambda: f"'state' has a {name} of {nonsense} " in log(tmp_path, "feedforward")
         )
         states.publish(FingerState(phase=FingerState.RUNNING, voltage=5.0))
         neighbour.wait(lambda: voltages)
