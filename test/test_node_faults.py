@@ -717,18 +717,24 @@ def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     assert (process.returncode, words) == (-signal.SIGINT, "")
 
 
+@pytest.mark.parametrize(
+    "hang",
+    [
+        "with over_within(0.2, 3): ctypes.PyDLL(None).sleep(100)",
+        "atexit.register(ctypes.PyDLL(None).sleep, 100); atexit.register(end_within, 0.2, 3)",
+    ],
+)
 def test_a_middleware_that_hangs_with_the_interpreters_lock_does_not_keep_a_program_from_its_end(
-    tmp_path,
+    tmp_path, hang
 ):
     (tmp_path / "program.py").write_text(
-        "import ctypes, time\n"
-        "from piezo_control.start import over_within\n"
+        "import atexit, ctypes, time\n"
+        "from piezo_control.start import end_within, over_within\n"
         "with over_within(0.2, 7):\n"
         "    pass\n"
         "time.sleep(0.5)\n"
         "print('on', flush=True)\n"
-        "with over_within(0.2, 3):\n"
-        "    ctypes.PyDLL(None).sleep(100)\n"
+        f"{hang}\n"
     )
     program = [sys.executable, tmp_path / "program.py"]
     result = subprocess.run(program, capture_output=True, text=True, timeout=TIMEOUT)
