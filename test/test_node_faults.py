@@ -25,8 +25,9 @@ from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
 
-from piezo_control.gripper import hold
+from piezo_control.gripper import Goal, hold
 from piezo_control.nodes import base
+from piezo_control.nodes.faces.asker import Asker
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
 from piezo_control.nodes.network import Networks
@@ -699,6 +700,19 @@ def test_a_gripper_with_another_sample_time_than_its_fingers_says_so_and_does_no
     node.fingers[1]._take(FingerState(phase=FingerState.RUNNING, period=1e-3))
     expected = "finger 'right' takes a sample every 0.001 s, 'sample_time' of 'gripper' is 0.0001 s"
     assert node.fingers[1].problem() == expected
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def test_a_gripper_that_is_started_again_opens_with_no_more_force_than_is_held():
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    for finger in node.fingers:
+        finger._take(FingerState(phase=FingerState.RUNNING, period=1e-4, max_force=2e-4))
+    node.move(Goal(60e-6, 1e-3, 20e-6), Asker())
+    assert [finger.max_force for finger in node.fingers] == [2e-4, 2e-4]
     node.destroy_node()
     rclpy.shutdown()
 
