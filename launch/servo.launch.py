@@ -20,10 +20,6 @@ from piezo_control.nodes import launched
 OF_THE_SERVO = {
     "driver": (str, "'simulated', 'udp', 'iio', or the path of a shared library"),
     "driver_options": (str, "of the driver"),
-    "controller_file": (
-        str,
-        "controller: a shipped name ('robust'), or the path of a parameter file",
-    ),
     "feedforward_file": (
         str,
         "parameter file of inverse and limits; the paper's finger where none is named",
@@ -33,6 +29,7 @@ OF_THE_SERVO = {
 }
 ARGUMENTS = (
     launched.ARGUMENTS
+    | {"controller": ("", "controller: a shipped name, or the path of a parameter file")}
     | {"params": ("", "parameter file, such as the servo.yaml that `commission` writes")}
     | {name: ("", text) for name, (_, text) in OF_THE_SERVO.items()}
 )
@@ -46,6 +43,8 @@ def nodes(context: LaunchContext) -> list[Node]:
         for name, (kind, _) in OF_THE_SERVO.items()
         if given[name]
     }
+    if given["controller"]:
+        asked["controller_file"] = ParameterValue(given["controller"], value_type=str)
     return launched.launched(context, given, {"servo": asked}, file_wins=False)
 
 

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from importlib.metadata import requires
 from io import TextIOWrapper
 from pathlib import Path
@@ -100,9 +101,8 @@ class SignalEvent(ctypes.Structure):
     )
 
 
-@contextmanager
-def over_within(seconds: float, code: int) -> Iterator[None]:
-    """End the program with an exit code where what is done here, when its work is done, takes longer than `seconds`.
+def end_within(seconds: float, code: int) -> Callable[[], None]:
+    """End the program with an exit code in `seconds`, whatever it does then; what is returned calls that off.
 
     Fast DDS hangs now and then where it is freed in the very moment in which other programs leave too, as after one
     Ctrl-C for all: it waits for its own discovery, which waits for it. It has the interpreter's lock meanwhile, so that
@@ -116,10 +116,17 @@ def over_within(seconds: float, code: int) -> Iterator[None]:
         raise OSError(ctypes.get_errno(), "no timer")
     once = (ctypes.c_long * 4)(0, 0, int(seconds), round(seconds % 1.0 * 1e9))
     libc.timer_settime(timer, 0, ctypes.byref(once), None)
+    return partial(libc.timer_delete, timer)
+
+
+@contextmanager
+def over_within(seconds: float, code: int) -> Iterator[None]:
+    """End the program with an exit code where what is done here, when its work is done, takes longer than `seconds`."""
+    call_off = end_within(seconds, code)
     try:
         yield
     finally:
-        libc.timer_delete(timer)
+        call_off()
 
 
 def how_to_get(package: str) -> str:

@@ -96,3 +96,39 @@ def test_defaults_that_are_shown_are_those_in_force(started):
 @pytest.mark.parametrize("file", ["finger.launch.py", "gripper.launch.py", "servo.launch.py"])
 def test_arguments_of_all_nodes_are_offered_by_every_file(file):
     assert set(launched.ARGUMENTS) <= set(offered(file))
+
+
+def test_a_file_reaches_the_gripper_and_its_picture(started, tmp_path):
+    file = tmp_path / "gripper.yaml"
+    file.write_text("/**/gripper: {ros__parameters: {joint: jaw, force_limit: 1.0e-3}}")
+    nodes = started("gripper.launch.py", namespace="cell", gripper_params=str(file))
+    assert (nodes["/cell/gripper"]["joint"], nodes["/cell/gripper"]["force_limit"]) == ("jaw", 1e-3)
+    assert nodes["/cell/gripper"]["sample_time"] == 1e-4  # what the file has nothing for stays
+
+
+def test_a_servo_has_the_controller_that_was_named(started, tmp_path):
+    file = tmp_path / "servo.yaml"
+    file.write_text("/**/servo: {ros__parameters: {controller_file: fast, driver: udp}}")
+    nodes = started("servo.launch.py", params=str(file), controller="robust")
+    assert nodes["/finger/servo"]["controller_file"] == "robust"
+    assert nodes["/finger/servo"]["driver"] == "udp"
+
+
+def test_an_experiment_takes_its_options_by_their_names(monkeypatch):
+    commands = []
+    monkeypatch.setattr(
+        ExecuteLocal,
+        "execute",
+        lambda process, context: commands.append(
+            [perform_substitutions(context, part) for part in process.cmd]
+        ),
+    )
+    source = PythonLaunchDescriptionSource(str(FOLDER / "experiment.launch.py"))
+    given = {"controller": "robust fast", "out": "there", "arguments": "--duration 0.1"}
+    service = LaunchService()
+    service.include_launch_description(
+        LaunchDescription([IncludeLaunchDescription(source, launch_arguments=given.items())])
+    )
+    assert service.run() == 0
+    words = ["step", "--out", "there", "--controller", "robust", "fast", "--duration", "0.1"]
+    assert [command[1:] for command in commands] == [words]

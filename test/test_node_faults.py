@@ -25,8 +25,9 @@ from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
 
-from piezo_control.gripper import hold
+from piezo_control.gripper import Goal, hold
 from piezo_control.nodes import base
+from piezo_control.nodes.faces.asker import Asker
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
 from piezo_control.nodes.network import Networks
@@ -174,15 +175,17 @@ def test_a_feedforward_that_stood_still_does_not_go_on(neighbour, tmp_path):
 
 
 @pytest.mark.shows("a value that is not finite or that no finger reaches")
-@pytest.mark.parametrize("nonsense", [math.nan, 1e30])
-def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, nonsense):
+@pytest.mark.parametrize(
+    ("name", "nonsense"), [("voltage", math.nan), ("voltage", 1e30), ("max_force", -1e-3)]
+)
+def test_a_state_with_nonsense_is_no_place_to_begin_at(neighbour, tmp_path, name, nonsense):
     with node("feedforward", tmp_path, mode="free_running", slew_limit=1e3):
         voltages = neighbour.listen(Sample, "voltage")
         states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
-        states.publish(FingerState(phase=FingerState.RUNNING, voltage=nonsense))
+        states.publish(FingerState(phase=FingerState.RUNNING, **{name: nonsense}))
         Stream(neighbour, "command", 10e-6)
         neighbour.wait(
-            lambda: f"'state' has a voltage of {nonsense} V" in log(tmp_path, "feedforward")
+            lambda: f"'state' has a {name} of {nonsense} " in log(tmp_path, "feedforward")
         )
         states.publish(FingerState(phase=FingerState.RUNNING, voltage=5.0))
         neighbour.wait(lambda: voltages)
@@ -701,6 +704,19 @@ def test_a_gripper_with_another_sample_time_than_its_fingers_says_so_and_does_no
     rclpy.shutdown()
 
 
+def test_a_gripper_that_is_started_again_opens_with_no_more_force_than_is_held():
+    rclpy.init()
+    node = GripperNode()
+    node.trigger_configure()
+    node.trigger_activate()
+    for finger in node.fingers:
+        finger._take(FingerState(phase=FingerState.RUNNING, period=1e-4, max_force=2e-4))
+    node.move(Goal(60e-6, 1e-3, 20e-6), Asker())
+    assert [finger.max_force for finger in node.fingers] == [2e-4, 2e-4]
+    node.destroy_node()
+    rclpy.shutdown()
+
+
 def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     (tmp_path / "slow.py").write_text(
         "print('importing', flush=True)\nimport time\ntime.sleep(60)\n"
@@ -715,18 +731,24 @@ def test_ctrl_c_during_the_imports_leaves_no_traceback(tmp_path):
     assert (process.returncode, words) == (-signal.SIGINT, "")
 
 
+@pytest.mark.parametrize(
+    "hang",
+    [
+        "with over_within(0.2, 3): ctypes.PyDLL(None).sleep(100)",
+        "atexit.register(ctypes.PyDLL(None).sleep, 100); atexit.register(end_within, 0.2, 3)",
+    ],
+)
 def test_a_middleware_that_hangs_with_the_interpreters_lock_does_not_keep_a_program_from_its_end(
-    tmp_path,
+    tmp_path, hang
 ):
     (tmp_path / "program.py").write_text(
-        "import ctypes, time\n"
-        "from piezo_control.start import over_within\n"
+        "import atexit, ctypes, time\n"
+        "from piezo_control.start import end_within, over_within\n"
         "with over_within(0.2, 7):\n"
         "    pass\n"
         "time.sleep(0.5)\n"
         "print('on', flush=True)\n"
-        "with over_within(0.2, 3):\n"
-        "    ctypes.PyDLL(None).sleep(100)\n"
+        f"{hang}\n"
     )
     program = [sys.executable, tmp_path / "program.py"]
     result = subprocess.run(program, capture_output=True, text=True, timeout=TIMEOUT)

@@ -209,11 +209,12 @@ def test_feedback_answers_each_sample_once_and_repeats_on_request(neighbour, tmp
     assert "'deflection' sample 2 is nan, must be finite" in log
 
 
-def test_a_feedback_that_is_started_again_keeps_the_reference(neighbour, tmp_path):
+def test_a_feedback_that_is_started_again_keeps_reference_and_force(neighbour, tmp_path):
     states = neighbour.node.create_publisher(FingerState, "state", LATCHED)
-    states.publish(FingerState(phase=FingerState.WAITING, reference=7e-6))
+    states.publish(FingerState(phase=FingerState.WAITING, reference=7e-6, max_force=2e-4))
     with node("feedback", tmp_path, controller="none"):
         commands = neighbour.listen(Sample, "command")
+        followed = neighbour.listen(Profile, "reference_followed_profile", FOLLOWED)
         reference = neighbour.publisher("reference", SETPOINT)
         deflection = neighbour.publisher("deflection")
         neighbour.wait(lambda: states.get_subscription_count() > 0)
@@ -222,17 +223,20 @@ def test_a_feedback_that_is_started_again_keeps_the_reference(neighbour, tmp_pat
         neighbour.tell("feedback", reference, sample(0, -2e-6))  # from now on somebody says it
         deflection.publish(sample(1, 0.0))
         neighbour.wait(lambda: commands[-1].number == 1)
+        neighbour.wait(lambda: len(followed) > 1)
     assert commands[0].value == 7e-6 and commands[-1].value == -2e-6
+    assert [f.max_force for f in followed] == [2e-4, 0.0]  # N: a set-point says none
 
 
-def test_the_finger_tells_the_reference_that_is_followed(neighbour, tmp_path):
+def test_the_finger_tells_what_is_followed_and_with_which_force(neighbour, tmp_path):
     followed = neighbour.node.create_publisher(Profile, "reference_followed_profile", FOLLOWED)
     with node("cantilever", tmp_path):
         states = neighbour.listen(FingerState, "state", LATCHED)
         neighbour.wait(lambda: states)
         assert math.isnan(states[0].reference)
-        followed.publish(Profile(time=[0.0], value=[7e-6]))
+        followed.publish(Profile(time=[0.0], value=[7e-6], max_force=2e-4))
         neighbour.wait(lambda: states[-1].reference == 7e-6)
+        assert states[-1].max_force == 2e-4
 
 
 def test_force_control_waits_for_what_is_expected_and_answers_with_its_law(neighbour, tmp_path):

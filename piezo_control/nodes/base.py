@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import math
 import sys
 import time
@@ -47,7 +48,7 @@ from piezo_control.parameters import (
     unknown,
 )
 from piezo_control.safety import PHASES, Guard
-from piezo_control.start import FREEING, over_within, stop_at_signals
+from piezo_control.start import FREEING, end_within, over_within, stop_at_signals
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 FAREWELL = 2.0  # s: so long the end of a program waits for those who have still to be told
@@ -382,6 +383,7 @@ def run(*node_types: type[FingerNode]) -> int:
     """
     stop = stop_at_signals()
     nodes: list[FingerNode] = []
+    serving = ExitStack()
     code = 2
     try:
         parse(node_types)
@@ -400,12 +402,12 @@ def run(*node_types: type[FingerNode]) -> int:
                     node.trigger_activate()
             else:
                 node.say("waits to be configured and activated, as by `fingerctl lifecycle`")
-        with spin.serving(nodes) as serve:
-            serve(stop.is_set)
-            for node in reversed(nodes):
-                node.trigger_shutdown()
-            end = time.monotonic() + FAREWELL
-            serve(lambda: time.monotonic() > end or all(node.is_told() for node in nodes))
+        serve = serving.enter_context(spin.serving(nodes))
+        serve(stop.is_set)
+        for node in reversed(nodes):
+            node.trigger_shutdown()
+        end = time.monotonic() + FAREWELL
+        serve(lambda: time.monotonic() > end or all(node.is_told() for node in nodes))
         code = 0
     except (ParameterError, InvalidParameterTypeException, InvalidParameterValueException) as error:
         name, text = node_types[min(len(nodes), len(node_types) - 1)].NAME, str(error)
@@ -418,7 +420,9 @@ def run(*node_types: type[FingerNode]) -> int:
     finally:
         for node in reversed(nodes):
             node.trigger_shutdown()
+        atexit.register(end_within, FREEING, code)  # Python frees the rest of it
         with over_within(FREEING, code):
+            serving.close()
             for node in reversed(nodes):
                 node.destroy_node()
             rclpy.try_shutdown()

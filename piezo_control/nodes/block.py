@@ -25,7 +25,13 @@ from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.qos import FAULTS, LATCHED, NEWEST, SAMPLE
 from piezo_control.nodes.sample_output import SampleOutput
 from piezo_control.nodes.sole_input import SoleInput
-from piezo_control.safety import LARGEST_DEFLECTION, LARGEST_VOLTAGE, Guard, is_physical
+from piezo_control.safety import (
+    LARGEST_DEFLECTION,
+    LARGEST_FORCE,
+    LARGEST_VOLTAGE,
+    Guard,
+    is_physical,
+)
 from piezo_control.sequence import FIRST, REPEATED, STRAY, Sequence
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 
@@ -168,13 +174,14 @@ class BlockNode(FingerNode):
         """Take a state, unless nonsense is in what a block begins with; a reference may be unknown."""
         reference = 0.0 if math.isnan(state.reference) else state.reference
         values = (
-            ("voltage", "V", state.voltage, LARGEST_VOLTAGE),
-            ("reference", "m", reference, LARGEST_DEFLECTION),
+            ("voltage", "V", state.voltage, -LARGEST_VOLTAGE, LARGEST_VOLTAGE),
+            ("reference", "m", reference, -LARGEST_DEFLECTION, LARGEST_DEFLECTION),
+            ("max_force", "N", state.max_force, 0.0, LARGEST_FORCE),
         )
-        for name, unit, value, largest in values:
-            if not is_physical(value, largest):
+        for name, unit, value, low, high in values:
+            if not low <= value <= high:
                 self.get_logger().error(
-                    f"'state' has a {name} of {value} {unit}, must be finite and within ±{largest:g} {unit}; ignored",
+                    f"'state' has a {name} of {value} {unit}, must be in [{low:g}, {high:g}] {unit}; ignored",
                     throttle_duration_sec=1.0,
                 )
                 return

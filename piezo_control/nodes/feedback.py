@@ -355,7 +355,8 @@ class FeedbackNode(BlockNode):
             if self.finger and self.finger.phase in TAKES_NONE:
                 self._wait_at_rest()
         if self.finger and not self.reference.is_known:
-            self.reference.hold(self.finger.reference)  # that of a feedback before this one
+            # Those of a feedback before this one.
+            self.reference.hold(self.finger.reference, self.finger.max_force)
         self.reference.say(sample.header)
         p, reference = self.parameters, self.reference[sample.number]
         answer.by_controller = self._has_a_rate()
@@ -363,7 +364,10 @@ class FeedbackNode(BlockNode):
             answer.value = self.law.step(self.asked[sample.number], sample.value)
         elif self._is_expected() and self.touch:
             answer.value = self.touch.step(
-                reference, sample.value, self.expected.value, self.reference.max_force
+                reference,
+                sample.value,
+                self.expected.value,
+                self.reference.max_force or math.inf,
             )
             self._tell_push(sample, self.touch.push)
         else:

@@ -273,6 +273,8 @@ class Finger:
     def _take(self, state: FingerState) -> None:
         if self not in self._node.fingers:
             return  # it was on its way when the gripper was stopped
+        if self.state is None:
+            self.max_force = state.max_force  # that of a gripper before this one
         restarted = self.state is not None and state.samples < self.state.samples
         self.state = state
         self.heard = self._node.listened

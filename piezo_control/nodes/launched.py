@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from launch import LaunchContext
@@ -50,6 +50,7 @@ def launched(
     given: Mapping[str, str],
     parameters: Mapping[str, Mapping[str, Any]],
     file_wins: bool,
+    remappings: Sequence[tuple[str, str]] = (),
 ) -> list[Node]:
     """Return the nodes whose `parameters` are named, by what is `given` for `ARGUMENTS` and `params`, a file.
 
@@ -77,6 +78,7 @@ def launched(
             executable=name,
             namespace=given["namespace"],
             parameters=sources(name),
+            remappings=remappings,
             ros_arguments=["--log-level", given["log_level"]],
             respawn=is_on(given, "respawn"),
             respawn_delay=RESPAWN_DELAY,

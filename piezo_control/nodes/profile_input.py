@@ -63,8 +63,8 @@ class ProfileInput:
         self._node = node
         self._topic = topic
         self._largest = largest
-        self.max_force = math.inf
-        """Force (N) that the sender allows; infinite where it says nothing."""
+        self.max_force = 0.0
+        """Force (N) that the sender allows, as messages have it: 0 where it says nothing."""
         self._sampled = SampledSignal(Profile([0.0], [0.0]), sample_time)
         self._is_new = True
         self.is_known = False
@@ -93,10 +93,12 @@ class ProfileInput:
         self._sampled = SampledSignal(self._sampled.signal, sample_time)
         self._is_new = True
 
-    def hold(self, value: float) -> None:
-        """Stay at `value` where nobody has sent anything; NaN: as it is."""
-        if not (self.is_known or math.isnan(value) or value == self[0]):
+    def hold(self, value: float, max_force: float) -> None:
+        """Stay at `value` with `max_force` (N; 0: none) where nobody has sent anything; NaN: as it is."""
+        held = (self[0], self.max_force)
+        if not (self.is_known or math.isnan(value) or (value, max_force) == held):
             self._sampled = SampledSignal(Profile([0.0], [value]), self._sampled.sample_time)
+            self.max_force = max_force
             self._is_new = True
             self._on_change()
 
@@ -111,7 +113,7 @@ class ProfileInput:
             waveform.header = header
             self._waveforms.publish(waveform)
         elif isinstance(signal, Profile):
-            profile = to_message(signal, 0.0 if math.isinf(self.max_force) else self.max_force)
+            profile = to_message(signal, self.max_force)
             profile.header = header
             self._profiles.publish(profile)
 
@@ -148,6 +150,6 @@ class ProfileInput:
             self._node.refuse(f"'{topic}' ignored: {error}")
             return
         self._sampled = SampledSignal(signal, self._sampled.sample_time)
-        self.max_force = max_force or math.inf
+        self.max_force = max_force
         self._is_new = self.is_known = True
         self._on_change()

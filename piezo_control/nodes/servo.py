@@ -306,7 +306,7 @@ class ServoNode(FingerNode):
 
     def _refer(self) -> None:
         if self.servo:
-            self.servo.refer(self.reference.signal, self.reference.max_force)
+            self.servo.refer(self.reference.signal, self.reference.max_force or math.inf)
             self.reference.say(Header(stamp=base.system_time()))
 
     def _on_temperature(self, degc: float, _: float) -> None:
@@ -450,6 +450,7 @@ class ServoNode(FingerNode):
             state.jitter = lateness_quantile(s.lateness, 0.999)
             state.text = self._wrong(s)
             state.reference = self.reference[state.samples]
+            state.max_force = self.reference.max_force
             state.since = base.wall_time(self._since)
             state.times = s.faults
             if self._last:

@@ -428,6 +428,7 @@ class CantileverNode(FingerNode):
         state.times = self.guard.times
         state.header.stamp = self.sample.header.stamp
         state.reference = self.followed[self.number] if self.follows else math.nan
+        state.max_force = self.followed.max_force
         state.deflection = self.sample.value
         state.voltage = self.plant.voltage
         state.tip_force = self.plant.tip_force
