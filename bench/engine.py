@@ -19,6 +19,7 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters
 from piezo_control.parameters import build, load
 from piezo_control.profile import Profile
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_sim import engine
 from piezo_sim.experiment import monte_carlo
 from piezo_sim.plant.cantilever import CantileverParameters
@@ -46,7 +47,7 @@ def closed_loop() -> list[dict[str, Any]]:
                 FeedforwardParameters(hysteresis=hysteresis),
                 _paper_controller(),
                 TemperatureParameters(),
-                Profile([0.0, samples * 1e-4], [0.0, 15e-6], linear=True),
+                Profile([0.0, samples * SAMPLE_TIME], [0.0, 15e-6], linear=True),
                 samples,
                 compiled=compiled,
             )

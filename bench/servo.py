@@ -17,6 +17,7 @@ from piezo_control.compiled import compiled
 from piezo_control.feedback import FeedbackParameters, read_controller
 from piezo_control.feedforward import Feedforward, FeedforwardParameters
 from piezo_control.hysteresis import HysteresisParameters
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.servo.driver import FRESH
 from piezo_control.servo.law import (
     Laws,
@@ -51,9 +52,9 @@ def busy(cores: int):
             process.wait()
 
 
-def in_time(servos: int = 1, sample_time: float = 1e-4) -> tuple[float, float]:
+def in_time(servos: int = 1, sample_time: float = SAMPLE_TIME) -> tuple[float, float]:
     """Return the shares of periods that servos begin within a tenth of their period, and that they miss."""
-    is_certified = sample_time == 1e-4
+    is_certified = sample_time == SAMPLE_TIME
     controller = (
         read_controller("robust") if is_certified else FeedbackParameters(sample_time=sample_time)
     )
@@ -125,8 +126,8 @@ def cost() -> float:
         thresholds=tuple(3.0 * i for i in range(PLAYS)), weights=(3e-7, *[4e-8] * (PLAYS - 1))
     )
     feedforward = FeedforwardParameters(hysteresis=hysteresis)
-    settings = settings_of(ServoParameters(), feedforward, 1e-4)
-    laws = laws_of(read_controller("robust"), Feedforward(feedforward, 1e-4))
+    settings = settings_of(ServoParameters(), feedforward, SAMPLE_TIME)
+    laws = laws_of(read_controller("robust"), Feedforward(feedforward, SAMPLE_TIME))
     references = 5e-6 * np.sin(2e-3 * np.arange(300_000))
     loop = compiled(run_steps)
     loop(settings, laws, watch_at_rest(), references[:10])

@@ -15,13 +15,14 @@ from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 from piezo_control.nodes import launched
+from piezo_control.sequence import SAMPLE_TIME
 
 ARGUMENTS = launched.ARGUMENTS | {
     "controller": ("robust", "controller: a shipped name, or the path of a parameter file"),
     "params": ("", "parameter file of the finger's nodes, over the arguments here"),
     "plant": ("simulated", "'simulated', or 'none': your driver publishes deflection, and applies voltage"),
     "mode": ("lockstep", "lockstep or free_running"),
-    "sample_time": ("0.0001", "sample time in s; that of the controller's design"),
+    "sample_time": (str(SAMPLE_TIME), "sample time in s; that of the controller's design"),
     "force_control": ("false", "feel and limit the force, in place of the controller (docs/touch.md)"),
     "state_period": ("0.1", "how often the finger's state is published, in s"),
 }  # fmt: skip

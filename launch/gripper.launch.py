@@ -18,11 +18,12 @@ from launch_ros.substitutions import FindPackageShare
 from piezo_control.nodes import launched
 from piezo_control.nodes.gripper import GripperNodeParameters
 from piezo_control.parameters import build, load
+from piezo_control.sequence import SAMPLE_TIME
 
 FINGERS = ("left", "right")  # the default of the gripper node; lists do not pass launch whole
 ARGUMENTS = launched.ARGUMENTS | {
     "namespace": ("", "namespace of the gripper; those of the fingers are below it"),
-    "sample_time": ("0.0001", "sample time in s, of fingers and gripper alike"),
+    "sample_time": (str(SAMPLE_TIME), "sample time in s, of fingers and gripper alike"),
     "force_control": ("true", "the fingers keep a force limit by themselves (docs/touch.md)"),
     "state_period": ("0.01", "how often a finger's state is published, in s; as joint states are"),
     "joint_states": (

@@ -27,7 +27,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from piezo_control.hysteresis import REACH
 from piezo_control.parameters import ParameterError, build, load, parameter
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.shared import shared_folder
 
 
@@ -50,7 +52,7 @@ class FeedbackParameters:
         "feedforward undoes that, `compensator: sensorless`",
     )
     sample_time: float = parameter(
-        1e-4, "sample time the coefficients were designed for", unit="s", low=1e-6, high=1.0
+        SAMPLE_TIME, "sample time the coefficients were designed for", unit="s", low=1e-6, high=1.0
     )
     delay_samples: int = parameter(
         1, "delay from the voltage to the reading that the coefficients were designed for", low=0,
@@ -60,10 +62,10 @@ class FeedbackParameters:
         (), "denominator of the D(s) that they were designed for; none: not said"
     )
     command_low: float = parameter(
-        -22e-6, "lowest command; the end of the inverse's reachable range", unit="m"
+        REACH[0], "lowest command; the end of the inverse's reachable range", unit="m"
     )
     command_high: float = parameter(
-        22e-6, "highest command; the end of the inverse's reachable range", unit="m"
+        REACH[1], "highest command; the end of the inverse's reachable range", unit="m"
     )
     a: tuple[float, ...] = parameter((), "state matrix, order x order, row-major")
     b: tuple[float, ...] = parameter((), "input of the error to the states", unit="1/m")

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from piezo_control.hysteresis import (
+    REACH,
     Coefficients,
     HysteresisParameters,
     State,
@@ -40,7 +41,10 @@ class FeedforwardParameters(VoltageParameters):
         choices=("inverse", "static_gain"),
     )
     static_gain: float = parameter(
-        22.0e-6 / 40.0, "deflection per volt, end to end of the loop", unit="m/V", low=1e-12
+        (REACH[1] - REACH[0]) / (VoltageParameters.voltage_high - VoltageParameters.voltage_low),
+        "deflection per volt, end to end of the loop",
+        unit="m/V",
+        low=1e-12,
     )
     hysteresis: HysteresisParameters = group(HysteresisParameters)
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from piezo_control.parameters import ParameterError, parameter
 from piezo_control.profile import Profile
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.touch import TouchParameters
 
 SMALLEST = 1e-9
@@ -49,7 +50,9 @@ REST_TIME = 0.05
 class GripperParameters:
     """Geometry and limits of a gripper of two fingers."""
 
-    sample_time: float = parameter(1e-4, "sample time of the fingers", unit="s", low=1e-7, high=1.0)
+    sample_time: float = parameter(
+        SAMPLE_TIME, "sample time of the fingers", unit="s", low=1e-7, high=1.0
+    )
     rest_opening: float = parameter(
         40e-6, "opening with both fingers at deflection 0", unit="m", low=0.0, high=1e-2
     )

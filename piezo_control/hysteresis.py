@@ -48,6 +48,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from piezo_control.parameters import ParameterError, parameter
+from piezo_control.safety import VoltageParameters
+from piezo_control.sequence import SAMPLE_TIME
 
 
 @dataclass(frozen=True)
@@ -372,6 +374,14 @@ def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[fl
     # Each voltage twice: at rest, thresholds that depend on the rate are the plain ones.
     ends = [operator_step(operator, state, voltage) for voltage in 2 * (low, low, high, high)]
     return ends[5], ends[7]
+
+
+REACH = reachable_range(
+    coefficients(HysteresisParameters(), SAMPLE_TIME),
+    VoltageParameters.voltage_low,
+    VoltageParameters.voltage_high,
+)
+"""Of the paper's finger (m)."""
 
 
 def check_plays(thresholds: Sequence[float], plays: Sequence[float]) -> None:

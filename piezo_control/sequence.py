@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
+SAMPLE_TIME = 1e-4
+"""Of a finger's loop (s), where nothing else is said."""
 NEW, REPEATED, FIRST, STRAY = range(4)
 
 

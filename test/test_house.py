@@ -140,3 +140,18 @@ def test_every_file_names_its_licence():
         and "SPDX-License-Identifier: Apache-2.0" not in (ROOT / name).read_text()[:200]
     ]
     assert unnamed == []
+
+
+def test_a_number_of_the_finger_stands_in_one_place():
+    """D(s) (eq. 5), its reach and its sample time are written once; all else refers to that."""
+    places: dict[float, set[str]] = {5.7e-8: set(), 8.1e-6: set(), 22e-6: set()}
+    for path in MODULES:
+        tree = ast.parse((ROOT / path).read_text())
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and node.value in places:
+                places[node.value].add(str(path))
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "parameter":
+                units = [ast.unparse(k.value) for k in node.keywords if k.arg == "unit"]
+                assert ast.unparse(node.args[0]) != "0.0001" or units != ["'s'"], path
+    dynamics = {"piezo_control/dynamics.py"}
+    assert places == {5.7e-8: dynamics, 8.1e-6: dynamics, 22e-6: set()}

@@ -25,17 +25,20 @@ from std_srvs.srv import Trigger
 from test_nodes import TIMEOUT, Neighbour, neighbour, node, sample
 from trajectory_msgs.msg import JointTrajectory
 
+from piezo_control.feedback import read_controller
 from piezo_control.gripper import Goal, hold
 from piezo_control.nodes import base
 from piezo_control.nodes.faces.asker import Asker
+from piezo_control.nodes.feedback import FeedbackNode
 from piezo_control.nodes.feedforward import FeedforwardNode
 from piezo_control.nodes.gripper import GripperNode
 from piezo_control.nodes.network import Networks
 from piezo_control.nodes.qos import FAULTS, LATCHED, SAMPLE, SETPOINT
+from piezo_control.parameters import flatten
 from piezo_control.start import Stop
 from piezo_gripper_msgs.msg import Fault, FingerState, Sample
 from piezo_sim.experiment.cases import params_folder
-from piezo_sim.experiment.on_nodes.processes import NodeProcesses
+from piezo_sim.experiment.on_nodes.processes import NodeDied, NodeProcesses
 
 __all__ = ["neighbour"]  # a fixture of the module above
 SLEW = 4e4 * 1e-4  # V: default slew limit times sample time
@@ -410,6 +413,57 @@ def test_a_controller_changes_as_a_whole_or_not_at_all(neighbour, tmp_path):
         answer = neighbour.set("feedback", controller_file="robsut")
         assert not answer.successful and "robust" in answer.reason
         assert neighbour.get("feedback", "name") == "b"
+
+
+def test_what_is_given_beside_a_controllers_file_counts(neighbour, tmp_path):
+    with node("feedback", tmp_path, controller_file="robust", command_high=5e-6):
+        assert neighbour.get("feedback", "command_high") == 5e-6
+        assert neighbour.get("feedback", "command_low") == -22e-6  # of the file
+        answer = neighbour.set("feedback", controller_file="fast", command_high=3e-6)
+        assert answer.successful
+        assert neighbour.get("feedback", "name") == "fast"
+        assert neighbour.get("feedback", "command_high") == 3e-6
+        answer = neighbour.set("feedback", controller_file="robust", d=0.5)
+        assert not answer.successful and answer.reason.startswith("d: part of a controller")
+        assert neighbour.get("feedback", "controller_file") == "fast"
+    ended = node("feedback", tmp_path, "feedback_paper.yaml", controller_file="robust")
+    with pytest.raises(NodeDied), ended:
+        neighbour.wait(lambda: ended.check())
+    assert "not as in that of 'controller_file' (robust)" in log(tmp_path, "feedback")
+
+
+@pytest.mark.parametrize("is_active", [True, False])
+def test_the_controller_that_was_set_last_is_the_one_in_use(neighbour, is_active):
+    own = flatten(read_controller("paper")) | {"name": "own", "certified": False}
+    types = {name: base.parameter_type(FeedbackNode.PARAMETERS, name) for name in own}
+    feedback = FeedbackNode()
+    feedback.trigger_configure()
+    if is_active:
+        feedback.trigger_activate()
+    for changes, name in (
+        ([Parameter("controller_file", value="robust")], "robust"),
+        ([Parameter(n, kind, own[n]) for n, kind in types.items()], "own"),
+        ([Parameter("controller_file", value="robust")], "robust"),
+    ):
+        assert feedback.set_parameters_atomically(changes).successful
+        assert feedback.get_parameter("name").value == name
+        assert not is_active or feedback.law.parameters.name == name
+    feedback.set_parameters_atomically([Parameter(n, kind, own[n]) for n, kind in types.items()])
+    assert feedback.get_parameter("controller_file").value == ""
+    if not is_active:
+        feedback.trigger_activate()
+    assert feedback.law.parameters.name == "own"
+    feedback.destroy_node()
+
+
+def test_a_recorder_takes_no_topics_that_it_would_not_record(neighbour, tmp_path):
+    with node("recorder", tmp_path, bag=tmp_path / "bag", autostart=False):
+        assert neighbour.set("recorder", topics=["voltage", "command"]).successful
+        assert neighbour.change_state("recorder", Transition.TRANSITION_CONFIGURE)
+        answer = neighbour.set("recorder", topics=["voltage"])
+        assert not answer.successful and "clean it up first" in answer.reason
+        assert neighbour.change_state("recorder", Transition.TRANSITION_CLEANUP)
+        assert neighbour.set("recorder", topics=["voltage"]).successful
 
 
 def test_a_changed_parameter_is_used_before_the_first_sample(neighbour, tmp_path):

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from piezo_control.dynamics import DynamicsParameters, ModesParameters
-from piezo_control.feedforward import Feedforward, FeedforwardParameters
+from piezo_control.hysteresis import REACH
 from piezo_control.parameters import ParameterError, group, parameter
+from piezo_control.sequence import SAMPLE_TIME
 
-REACH = Feedforward(FeedforwardParameters(), sample_time=1e-4).reachable_range
-"""Of the default finger (m)."""
 METHODS = (
     "hinf", "given", "damped_integrator", "model_following", "pid", "integrator_notch",
 )  # fmt: skip
@@ -33,7 +32,9 @@ class FingerModel:
         low=0.0,
     )
     modes: ModesParameters = group(ModesParameters)
-    sample_time: float = parameter(1e-4, "sample time of the loop", unit="s", low=1e-6, high=0.1)
+    sample_time: float = parameter(
+        SAMPLE_TIME, "sample time of the loop", unit="s", low=1e-6, high=0.1
+    )
     amplifier_bandwidth_hz: float = parameter(
         0.0,
         "cut-off of the amplifier's first-order lag; 0: unlimited",

@@ -11,7 +11,8 @@ out: command (Sample, m), reference_followed_profile (Profile, m), reference_fol
 The newest of set-point, profile and waveform is followed; one that is started again stays at the reference of `state`, and what it is is said with the stamp of the first
 sample at which it is. With `controller: none` the reference passes through:
 open loop. A changed controller is taken whole or not at all, by `controller_file`, and takes over while the
-loop runs, with the command where it was. With `force_control`, in place of the controller, the loop follows the
+loop runs, with the command where it was; limits of the command and preview that are given with the file count
+instead of the file's. With `force_control`, in place of the controller, the loop follows the
 reference as long as the tip pushes with no more than the profile's `max_force` and its own `touch.force_limit`,
 and holds that force where something is in the way (:mod:`piezo_control.touch`). With `preview_band` profiles and
 waveforms are followed without lag, as far as the controller's band goes (:mod:`piezo_control.design.preview`).
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
+from collections.abc import Set
 from typing import Any
 
 from rclpy.parameter import Parameter
@@ -55,8 +56,19 @@ from piezo_gripper_msgs.msg import Dynamics, FingerState, Sample
 
 PUSH_PERIOD = 1e-2  # s, between two of the push
 
+CONTROLLER = frozenset(flatten(FeedbackParameters()))
 # What makes a controller; its limits of the command and its preview may change by themselves.
-DESIGN = frozenset(flatten(FeedbackParameters())) - {"command_low", "command_high", "preview_band"}
+DESIGN = CONTROLLER - {"command_low", "command_high", "preview_band"}
+
+
+def refuse_half(path: str, parameters: FeedbackNodeParameters, names: Set[str]) -> None:
+    """Raise ParameterError for those of the `names` that are not as in the controller of the file."""
+    whole, given = flatten(successor(path, parameters)), flatten(parameters)
+    if half := sorted(name for name in names if whole[name] != given[name]):
+        raise ParameterError(
+            f"{', '.join(half)}: part of a controller, which changes as a whole, and not as in that of "
+            f"'controller_file' ({path})"
+        )
 
 
 class FeedbackNode(BlockNode):
@@ -80,8 +92,8 @@ class FeedbackNode(BlockNode):
         self._is_held = False
         """Whether the finger is where the last answer left it, while this node is inactive."""
         self._file = ""
-        self._loading = False
-        self._take_file()
+        self.add_pre_set_parameters_callback(self._with_file)
+        self._begin_with_file()
         self.restart_law()
         self.reference = ProfileInput(
             self,
@@ -94,44 +106,42 @@ class FeedbackNode(BlockNode):
         self._look_ahead()
 
     def refuses_while_active(self, names: set[str]) -> set[str]:
-        fixed = {"mode", "sample_time", "subscribers", "age_limit", "force_control"}
+        fixed = {"mode", "subscribers", "age_limit", "force_control"}
         return {name for name in names if name in fixed or name.startswith("touch.")}
 
     def check(self, parameters: FeedbackNodeParameters) -> None:
         """Refuse the half of a controller, and one that cannot take over where the loop is."""
         if self.active:
             self._touching(parameters)
-        if parameters.controller_file not in ("", self.parameters.controller_file):
-            controller = successor(parameters.controller_file, self.parameters)
-            if self.active and controller.sample_time != parameters.sample_time:
-                raise ParameterError(
-                    f"'controller_file' is '{parameters.controller_file}', made for "
-                    f"{controller.sample_time:g} s, the loop runs at {parameters.sample_time:g} s: "
-                    f"deactivate '{self.NAME}' first"
-                )
-            if self.active:
-                self._started(replace(parameters, **vars(controller)))
-            return
         before, after = flatten(self.parameters), flatten(parameters)
         changed = {name for name in DESIGN if before[name] != after[name]}
+        if self.active and "sample_time" in changed:
+            raise ParameterError(
+                f"controller '{parameters.name}' is made for {parameters.sample_time:g} s, the loop runs at "
+                f"{self.parameters.sample_time:g} s: deactivate '{self.NAME}' first"
+            )
+        if path := parameters.controller_file:
+            if changed or path != self.parameters.controller_file:
+                refuse_half(path, parameters, DESIGN)
+        else:
+            self._check_single(parameters, changed)
+        if self.active:
+            self._started(parameters)
+
+    def _check_single(self, parameters: FeedbackNodeParameters, changed: set[str]) -> None:
+        """Refuse the half of a controller that comes from no file, and a certificate for one, given its changes."""
         if parameters.controller == self.parameters.controller == "none":
-            changed = set()  # no controller, so no half of one
-        if changed and not self._loading and "name" not in changed:
+            return  # no controller, so no half of one
+        if changed and "name" not in changed or changed in ({"name"}, {"name", "certified"}):
             raise ParameterError(
                 f"{', '.join(sorted(changed))}: part of a controller, which changes as a whole, with its "
                 "'name', by 'controller_file' or in one atomic request"
             )
-        if changed == {"name"} or changed == {"name", "certified"}:
-            raise ParameterError(
-                "'name': a controller changes as a whole, by 'controller_file' or in one atomic request"
-            )
-        if self.active and changed and not self._loading and parameters.certified:
+        if self.active and changed and parameters.certified:
             raise ParameterError(
                 "'certified' is true: single parameters bring no certificate; take the controller by "
                 "'controller_file', or set 'certified' to false with them"
             )
-        if self.active:
-            self._started(parameters)
 
     def restart(self) -> None:
         self.restart_law()
@@ -216,7 +226,7 @@ class FeedbackNode(BlockNode):
         return self.parameters.controller != "none" or self.parameters.force_control
 
     def start(self) -> None:
-        self._take_file()
+        self._say_origin()
         run = self.sequence if self._may_go_on() else None
         super().start()
         if run:
@@ -271,14 +281,13 @@ class FeedbackNode(BlockNode):
         return self.finger is not None and self.finger.phase in held
 
     def apply(self) -> None:
-        if not self._take_file():
-            p = self.parameters
-            law = self._started(p)
-            if law.parameters != self.law.parameters:
-                self._warn()
-            self.law = law
-            self._feel_on()
-            self._look_ahead()
+        self._say_origin()
+        law = self._started(self.parameters)
+        if law.parameters != self.law.parameters:
+            self._warn()
+        self.law = law
+        self._feel_on()
+        self._look_ahead()
 
     def _started(self, parameters: FeedbackNodeParameters) -> Feedback:
         """Return the law of `parameters`, started where the loop is; ValueError when it cannot be."""
@@ -289,25 +298,42 @@ class FeedbackNode(BlockNode):
             law.start(self.asked[self.sequence.next - 1], self.deflection, self.last.value)
         return law
 
-    def _take_file(self) -> bool:
-        """Take over the whole controller of `controller_file`, if that has changed."""
-        name = self.parameters.controller_file
-        if name in ("", self._file):
-            return False
-        controller = flatten(successor(name, self.parameters))
-        self._file, self._loading = name, True
-        changes = [
-            Parameter(
-                n, base.parameter_type(self.PARAMETERS, n), list(v) if isinstance(v, tuple) else v
+    def _with_file(self, changes: list[Parameter]) -> list[Parameter]:
+        """Return `changes` with the whole controller of a file that they name; what else they name stays as it is.
+
+        A controller that comes by single parameters is of no file.
+        """
+        values = {p.name: p.value for p in changes}
+        if "controller_file" not in values:
+            is_other = values.get("name", self.parameters.name) != self.parameters.name
+            return [*changes, *([Parameter("controller_file", value="")] if is_other else [])]
+        if not isinstance(path := values["controller_file"], str) or not path:
+            return changes
+        try:
+            controller = flatten(successor(path, self.parameters))
+        except ParameterError:
+            return changes  # `check` says why
+        types = {n: base.parameter_type(self.PARAMETERS, n) for n in controller.keys() - values}
+        return [*changes, *(Parameter(n, kind, controller[n]) for n, kind in types.items())]
+
+    def _begin_with_file(self) -> None:
+        """Take over the controller of the file that was given at start, with what was given beside it."""
+        given = self._parameter_overrides.keys() & CONTROLLER
+        if path := self.parameters.controller_file:
+            refuse_half(path, self.parameters, given & DESIGN)
+            result = self.set_parameters_atomically(
+                [Parameter("controller_file", value=path), *map(self.get_parameter, given)]
             )
-            for n, v in controller.items()
-        ]
-        result = self.set_parameters_atomically(changes)
-        self._loading = False
-        if not result.successful:
-            raise ParameterError(f"{name}: {result.reason}")
-        self.comes_from("controller", controller_file(name) if name != "none" else "")
-        return True
+            if not result.successful:
+                raise ParameterError(result.reason)
+            self._say_origin()
+
+    def _say_origin(self) -> None:
+        """Say where a controller comes from that is of another file than the last one."""
+        path = self.parameters.controller_file
+        if path != self._file:
+            self._file = path
+            self.comes_from("controller", controller_file(path) if path not in ("", "none") else "")
 
     def reset(self) -> None:
         was_latched = self.guard.is_latched

@@ -11,6 +11,7 @@ from piezo_control.feedforward import FeedforwardParameters
 from piezo_control.parameters import ParameterError, build, group, load, parameter
 from piezo_control.safety import SafetyParameters
 from piezo_control.sensorless import SensorlessParameters
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.servo.parameters import ServoParameters
 from piezo_control.thermometer import ThermometerParameters
 from piezo_control.touch import TouchParameters
@@ -61,7 +62,11 @@ class FeedforwardNodeParameters(
         choices=("inverse", "static_gain", "sensorless"),
     )
     sample_time: float = parameter(
-        1e-4, "time from command to command, for the slew limit", unit="s", low=1e-6, high=1.0
+        SAMPLE_TIME,
+        "time from command to command, for the slew limit",
+        unit="s",
+        low=1e-6,
+        high=1.0,
     )
     temperature_lockstep: bool = parameter(
         False, "sensorless in lock-step: each sample waits for its temperature, on a grid"

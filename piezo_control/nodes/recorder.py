@@ -32,6 +32,7 @@ from piezo_control.nodes.base import FingerNode
 from piezo_control.nodes.parameters import RecorderParameters
 from piezo_control.nodes.qos import FOLLOWED, LATCHED, SAMPLE
 from piezo_control.nodes.sample_output import nanoseconds, series_of
+from piezo_control.parameters import ParameterError
 from piezo_control.recording.recording import (
     BLOCK_TYPE,
     PROFILE_TYPE,
@@ -165,6 +166,13 @@ class RecorderNode(FingerNode):
                 )
             elif not is_needed and topic in self.single_samples:
                 self.destroy_subscription(self.single_samples.pop(topic))
+
+    def check(self, parameters: RecorderParameters) -> None:
+        """Refuse other topics than those it has subscribed."""
+        if self.types and parameters.topics != self.parameters.topics:
+            raise ParameterError(
+                "'topics' is fixed when 'recorder' is configured: clean it up first"
+            )
 
     def start(self) -> None:
         whose = self.get_namespace().strip("/").replace("/", "_") or "finger"

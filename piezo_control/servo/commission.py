@@ -52,6 +52,7 @@ from piezo_control.options import output_folder, within  # noqa: E402
 from piezo_control.parameters import ParameterError, build, dump, flatten  # noqa: E402
 from piezo_control.profile import Profile  # noqa: E402
 from piezo_control.safety import LARGEST_DEFLECTION, RAMPING, VoltageParameters  # noqa: E402
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.servo.driver import Driver, DriverError, applied, open_driver  # noqa: E402
 from piezo_control.servo.law import SENSOR_OLD, SENSOR_SILENT  # noqa: E402
 from piezo_control.servo.loop import Samples, Servo  # noqa: E402
@@ -450,7 +451,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--sample-time",
         type=within(float, 1e-6, 0.1),
-        default=1e-4,
+        default=SAMPLE_TIME,
         metavar="S",
         help="(%(default)s)",
     )

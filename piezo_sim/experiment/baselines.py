@@ -26,6 +26,7 @@ from piezo_control.parameters import build, dump, flatten, load
 from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording, read
 from piezo_control.report.page import Section
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_sim.experiment.cases import Case, params_folder
 from piezo_sim.experiment.on_engine import run_on_engine
 from piezo_sim.plant.sensor import SensorParameters
@@ -35,7 +36,6 @@ CONTROLLERS = ("paper", "robust", "fast", "integrator_notch", "pid", *FOLLOWING)
 PREVIEW_HZ = 150.0
 PREVIEW = ", preview"
 PREVIEWED = (f"robust{PREVIEW}", f"following{PREVIEW}")
-SAMPLE_TIME = 1e-4  # s
 STEP = 20e-6  # m
 STEP_TIME = 0.08  # s
 DEGC = (22.0, 32.0)

@@ -31,6 +31,7 @@ from piezo_control.profile import Profile
 from piezo_control.recording.recording import Recording, read
 from piezo_control.report.page import Section
 from piezo_control.sensorless import SensorlessParameters
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.shaping import ShapingParameters, ahead, shaper
 from piezo_control.thermal import ThermalParameters
 from piezo_sim.experiment import plots
@@ -42,7 +43,6 @@ from piezo_sim.plant.sensor import SensorParameters
 
 PLANTS = ("prandtl_ishlinskii", "truth")
 CONTROLLER = "robust"
-SAMPLE_TIME = 1e-4  # s
 SLOW = 2e-2  # s, sample time of a hold of minutes without a controller
 STEP = 20e-6  # m
 STROKE = 2.0 * STEP

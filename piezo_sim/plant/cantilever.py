@@ -36,6 +36,7 @@ from piezo_control.hysteresis import (
     operator_step,
 )
 from piezo_control.parameters import group, parameter
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_control.thermal import (
     REFERENCE_DEGC,
     Body,
@@ -70,7 +71,7 @@ class CantileverParameters:
         "class of the hysteresis: that of the inverse, or the truth plant (Bouc-Wen, logarithmic creep)",
         choices=("prandtl_ishlinskii", "truth"),
     )
-    sample_time: float = parameter(1e-4, "sample time", unit="s", low=1e-7, high=1.0)
+    sample_time: float = parameter(SAMPLE_TIME, "sample time", unit="s", low=1e-7, high=1.0)
     seed: int = parameter(1, "seed of the sensor's noise and drop-outs", low=0, high=2**63 - 1)
     hysteresis: HysteresisParameters = group(HysteresisParameters)
     dynamics: DynamicsParameters = group(DynamicsParameters)

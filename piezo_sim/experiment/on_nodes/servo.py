@@ -27,6 +27,7 @@ from piezo_control.profile import Profile
 from piezo_control.recording.reader import open_bag
 from piezo_control.recording.recording import BLOCK_TYPE, Recording, read
 from piezo_control.report.page import Section
+from piezo_control.sequence import SAMPLE_TIME
 from piezo_gripper_msgs.msg import FingerState
 from piezo_sim.experiment import study
 from piezo_sim.experiment.cases import RunFailed
@@ -91,10 +92,10 @@ def step_and_back(conductor: Conductor, nodes: NodeProcesses) -> None:
         return conductor.finger.phase == FingerState.RUNNING and recorded.get("samples", 0) > 0
 
     conductor.wait(is_running, COMPILING, "the servo and the recorder")
-    begin = conductor.finger.samples * 1e-4 + LEAD
+    begin = conductor.finger.samples * SAMPLE_TIME + LEAD
     instants = [begin, begin + HELD]
     conductor.publish("reference", Profile([0.0, *instants], [0.0, STEP, 0.0]))
-    end = round((instants[-1] + HELD) / 1e-4)
+    end = round((instants[-1] + HELD) / SAMPLE_TIME)
 
     def is_over() -> bool:
         nodes.check()
