@@ -29,7 +29,7 @@ from piezo_gripper_msgs.msg import FingerState, Sample
 NONSENSE = (math.nan, math.inf, -1e300, 1e6, 20.0, 5e-324)
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
 VALUES = (
-    True, -1, 2**63 - 1, 1e308, math.nan, 5e-324, "", "lockstep", "/nowhere", "a\n\u0000b", [], [1.0], [math.inf],
+    True, -1, 2**63 - 1, 1e308, math.nan, 5e-324, "", "lockstep", "/nowhere", "a\n\u0000b", [], [1.0], [1, 2], [math.inf],
     [-1.0] * 1000, ["a", "b"], [True], [b"\xff"],
 )  # fmt: skip
 PARAMETERS = (

@@ -64,6 +64,7 @@ FINGER = {
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
 STATE_PERIOD = 0.05  # s
 FLUSH_PERIOD = 0.5  # s
+STAMPS_END = 2**31 * 10**9  # ns: as far as the seconds of a stamp go
 PAUSE = (
     10**9
 )  # ns in the bag between two runs: what is on its way of the first comes before the second
@@ -238,6 +239,8 @@ class RecorderNode(FingerNode):
         if track.has_header:
             seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
             stamp = seconds * 10**9 + nanoseconds
+            if not self._is_time(topic, stamp):
+                return
             if track.is_numbered and not self._is_new(track, sample_number(data), stamp):
                 return
             if track.is_numbered:
@@ -271,6 +274,8 @@ class RecorderNode(FingerNode):
                 return
             number += 1
             stamp = first + later
+            if not self._is_time(topic, stamp):
+                continue
             if track.run == self.run and number == track.sequence.next > 1:
                 # Nearly all do go on, and what is saved here is left to the loop.
                 track.sequence.count(number)
@@ -287,6 +292,16 @@ class RecorderNode(FingerNode):
             if stamp >= self.newest or self.unstamped:
                 self._tell_time(max(stamp, self.newest, 1))
             self._put(track, stamp, data)
+
+    def _is_time(self, topic: str, stamp: int) -> bool:
+        """Say whether a bag can hold a time stamp (ns), and complain of one that it cannot."""
+        if 0 <= stamp < STAMPS_END:
+            return True
+        self.get_logger().error(
+            f"'{topic}' is stamped {stamp * 1e-9:g} s, must be in [0, {STAMPS_END * 1e-9:g}) s; not recorded",
+            throttle_duration_sec=1.0,
+        )
+        return False
 
     def _put(self, track: Track, stamp: int, data: bytes) -> None:
         """Write a message at `stamp` (ns in the bag)."""
