@@ -65,6 +65,7 @@ SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean
 STATE_PERIOD = 0.05  # s
 FLUSH_PERIOD = 0.5  # s
 STAMPS_END = 2**31 * 10**9  # ns: as far as the seconds of a stamp go
+BAG_END = 2**64  # ns: as far as a bag goes, in which each run comes after the one before
 PAUSE = (
     10**9
 )  # ns in the bag between two runs: what is on its way of the first comes before the second
@@ -293,12 +294,12 @@ class RecorderNode(FingerNode):
                 self._tell_time(max(stamp, self.newest, 1))
             self._put(track, stamp, data)
 
-    def _is_time(self, topic: str, stamp: int) -> bool:
-        """Say whether a bag can hold a time stamp (ns), and complain of one that it cannot."""
-        if 0 <= stamp < STAMPS_END:
+    def _is_time(self, topic: str, stamp: int, end: int = STAMPS_END) -> bool:
+        """Say whether a time stamp (ns) is in [0, end), and complain of one that is not."""
+        if 0 <= stamp < end:
             return True
         self.get_logger().error(
-            f"'{topic}' is stamped {stamp * 1e-9:g} s, must be in [0, {STAMPS_END * 1e-9:g}) s; not recorded",
+            f"'{topic}' is stamped {stamp * 1e-9:g} s, must be in [0, {end * 1e-9:g}) s; not recorded",
             throttle_duration_sec=1.0,
         )
         return False
@@ -306,6 +307,8 @@ class RecorderNode(FingerNode):
     def _put(self, track: Track, stamp: int, data: bytes) -> None:
         """Write a message at `stamp` (ns in the bag)."""
         assert self.writer is not None
+        if not self._is_time(track.connection.topic, stamp, BAG_END):
+            return
         try:
             self.writer.write(track.connection, stamp, data)
         except OSError as error:
