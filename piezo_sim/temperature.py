@@ -25,6 +25,7 @@ from piezo_control.parameters import ParameterError, parameter
 
 COLUMNS = {name: QUANTITIES[name] for name in ("time", "temperature")}  # of a table
 PROFILES = ("constant", "step", "ramp", "sine", "spotlight", "random_walk", "replay")
+LONGEST_WALK = 10**8  # values
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,11 @@ def _shape(p: TemperatureParameters, time: np.ndarray) -> np.ndarray:
 
 def _random_walk(p: TemperatureParameters, count: int) -> np.ndarray:
     """Return the walk from its begin, at least `count` values computed once in whole blocks."""
+    if count > LONGEST_WALK:
+        raise ParameterError(
+            f"'profile' is 'random_walk', which is computed from its begin: {count} values were asked for, must "
+            f"be at most {LONGEST_WALK}"
+        )
     blocks = max(1, math.ceil(math.log2(max(count, 1) / 4096)) + 1)
     return p.base_degc + _walk(p.seed, p.period, p.time_constant, 4096 * 2**blocks)[:count] * (
         p.amplitude_degc

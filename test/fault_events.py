@@ -21,15 +21,16 @@ from rcl_interfaces.srv import (
 )
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Temperature
 from std_srvs.srv import Trigger
 
-from piezo_control.nodes.qos import LATCHED, SAMPLE
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
+from piezo_gripper_msgs.msg import Dynamics, FingerState, Profile, Sample, Waveform
 
 NONSENSE = (math.nan, math.inf, -1e300, 1e6, 20.0, 5e-324)
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGKILL)
 VALUES = (
-    True, -1, 2**63 - 1, 1e308, math.nan, 5e-324, "", "lockstep", "/nowhere", "a\n\u0000b", [], [1.0], [math.inf],
+    True, -1, 2**63 - 1, 1e308, math.nan, 5e-324, "", "lockstep", "/nowhere", "a\n\u0000b", [], [1.0], [1, 2], [math.inf],
     [-1.0] * 1000, ["a", "b"], [True], [b"\xff"],
 )  # fmt: skip
 PARAMETERS = (
@@ -174,6 +175,28 @@ def refer(bench: Bench) -> None:
     bench.missing.append(("'reference' ignored: ",))
 
 
+def babble(bench: Bench) -> None:
+    """Nonsense on the topics that are sent now and then, on which nobody minds a second publisher."""
+    wild = bench.draw.choice(NONSENSE[:4])
+    sent, qos, words = bench.draw.choice(
+        (
+            (Sample(value=wild), SETPOINT, "tip_force"),
+            (Profile(time=[0.0, wild], value=[wild, 0.0]), LATCHED, "reference_profile"),
+            (Profile(time=[0.0], value=[wild]), LATCHED, "tip_force_profile"),
+            (Waveform(amplitude=wild, frequency=wild), SETPOINT, "reference_waveform"),
+            (Temperature(temperature=wild), SAMPLE, "temperature"),
+            (Dynamics(denominator=[wild], elastic_constant=wild), LATCHED, "dynamics"),
+        )
+    )
+    publisher = bench.node.create_publisher(type(sent), words, qos)
+    if bench.wait(2.0, lambda: publisher.get_subscription_count() > 0):
+        bench.missing.append((f"'{words}' ignored: ", f"'{words}' is {wild}", f"/{words}: "))
+    for _ in range(5):
+        publisher.publish(sent)
+        bench.wait(0.02)
+    bench.node.destroy_publisher(publisher)
+
+
 def flood(bench: Bench) -> None:
     """More set-points than anybody needs."""
     for k in range(5000):
@@ -198,4 +221,17 @@ def cut(bench: Bench) -> None:
     bench.processes.network.set("up")
 
 
-ALWAYS = (halt, hurry, end, restart, transition, parameter, ask, intrude, misfit, refer, flood)
+ALWAYS = (
+    halt,
+    hurry,
+    end,
+    restart,
+    transition,
+    parameter,
+    ask,
+    intrude,
+    misfit,
+    refer,
+    babble,
+    flood,
+)

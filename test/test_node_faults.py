@@ -629,6 +629,8 @@ def test_a_wild_voltage_neither_moves_the_tip_nor_goes_unnoticed(neighbour, tmp_
         (["-p", "voltage_high"], "voltage_high"),
         (["-p", "voltage_high:=1.0e308"], "voltage_high"),
         (["-p", "voltage_high:=[1.0, 2.0]"], "voltage_high"),
+        (["-p", "voltage_high:=[1, 2]"], "voltage_high"),
+        (["-p", "hysteresis.weights:=3"], "hysteresis.weights"),
         (["-p", "voltage_high:=text"], "voltage_high"),
         (
             ["-p", "voltage_hihg:=5.0"],
@@ -675,6 +677,9 @@ def test_whole_numbers_stand_for_doubles():
     assert node.parameters.voltage_high == 20.0
     assert node.parameters.hysteresis.weights == (1.0,)
     assert node.set_parameters([Parameter("voltage_low", value=-7)])[0].successful
+    assert node.parameters.voltage_low == -7.0
+    for name, value in (("voltage_low", [-8, -9]), ("hysteresis.weights", 3)):
+        assert not node.set_parameters([Parameter(name, value=value)])[0].successful
     assert node.parameters.voltage_low == -7.0
     node.destroy_node()
     rclpy.shutdown()

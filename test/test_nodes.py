@@ -26,6 +26,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Temperature
 
 from piezo_control.dynamics import DynamicsParameters
@@ -719,6 +720,50 @@ def test_series_are_recorded_as_the_samples_they_are_of(neighbour, tmp_path):
     once = {command.number: serialize_message(command) for command in heard}
     assert kept.data == [once[number] for number in range(250)]
     assert any(command.limited for command in heard) and heard[0].by_controller
+
+
+def test_stamps_that_no_bag_holds_end_no_recording(neighbour, tmp_path):
+    """Of single messages, of series, and of offsets within a series; what comes after them is recorded."""
+    bag = tmp_path / "bag"
+    with node("recorder", tmp_path, bag=bag) as recorder:
+        states = neighbour.listen(RecorderState, "recorder_state", LATCHED)
+        reference = neighbour.publisher("reference", SETPOINT)
+        series = neighbour.node.create_publisher(SampleSeries, "voltage_series", SAMPLE)
+        neighbour.wait(lambda: series.get_subscription_count() > 0 and states)
+        wrong = sample(0, 1e-6)
+        wrong.header.stamp.sec = -(2**31)
+        reference.publish(wrong)
+        for later in (-1, -(2**63), 2**63 - 1):
+            series.publish(SampleSeries(number=1, later=[later], value=[1.0], flags=[0]))
+        right = SampleSeries(number=1, later=[0, 100_000], value=[2.0, 3.0], flags=[0, 0])
+        series.publish(right)
+        row = states[-1].topics.index("voltage")
+        neighbour.wait(lambda: states[-1].recorded[row] == 2)
+        recorder.running["recorder"].terminate()
+        assert recorder.running["recorder"].wait(TIMEOUT) == 0
+    assert len(open_bag(bag).topics["/voltage"].data) == 2
+    said = (tmp_path / "recorder.log").read_text()
+    assert (
+        "'reference' is stamped -2.14748e+09 s, must be in [0, 2.14748e+09) s; not recorded" in said
+    )
+
+
+def test_a_clock_that_leaps_ends_no_temperature(neighbour, tmp_path):
+    """By the clock's own range, ahead or before 0; the grid goes on from wherever the clock is."""
+    with node("temperature", tmp_path, subscribers=1) as processes:
+        heard = neighbour.listen(Temperature, "temperature")
+        clock = neighbour.node.create_publisher(Clock, "clock", SAMPLE)
+        for seconds in (0, 2**31 - 1, 5):
+            last = Clock()
+            last.clock.sec = seconds
+            neighbour.insist(
+                clock, last, lambda s=seconds: heard and heard[-1].header.stamp.sec == s
+            )
+        last.clock.sec = -1
+        clock.publish(last)
+        log = tmp_path / "temperature.log"
+        neighbour.wait(lambda: "'clock' is -1 s, must be at least 0 s" in log.read_text())
+        processes.check()
 
 
 def test_the_end_of_a_run_that_comes_after_the_next_began_belongs_to_it(neighbour, tmp_path):

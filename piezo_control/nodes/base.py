@@ -308,13 +308,13 @@ class FingerNode(LifecycleNode):
 
     def _promoted(self, given: list[Parameter]) -> list[Parameter]:
         """Return the `given` parameters with whole numbers as doubles where doubles are declared."""
-        whole = (Parameter.Type.INTEGER, Parameter.Type.INTEGER_ARRAY)
         promoted = []
         for p in given:
             kind = self._declarations[p.name][0] if p.name in self._declarations else None
-            if p.type_ in whole and kind in (float, tuple[float, ...]):
-                value = float(p.value) if kind is float else [float(v) for v in p.value]
-                p = Parameter(p.name, value=value)
+            if p.type_ == Parameter.Type.INTEGER and kind is float:
+                p = Parameter(p.name, value=float(p.value))
+            elif p.type_ == Parameter.Type.INTEGER_ARRAY and kind == tuple[float, ...]:
+                p = Parameter(p.name, value=[float(v) for v in p.value])
             promoted.append(p)
         return promoted
 

@@ -65,6 +65,8 @@ FINGER = {
 SET_POINTS = ("reference", "tip_force")  # sent now and then, their numbers mean nothing
 STATE_PERIOD = 0.05  # s
 FLUSH_PERIOD = 0.5  # s
+STAMPS_END = 2**31 * 10**9  # ns: as far as the seconds of a stamp go
+BAG_END = 2**64  # ns: as far as a bag goes, in which each run comes after the one before
 PAUSE = (
     10**9
 )  # ns in the bag between two runs: what is on its way of the first comes before the second
@@ -246,6 +248,8 @@ class RecorderNode(FingerNode):
         if track.has_header:
             seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
             stamp = seconds * 10**9 + nanoseconds
+            if not self._is_time(topic, stamp):
+                return
             if track.is_numbered and not self._is_new(track, sample_number(data), stamp):
                 return
             if track.is_numbered:
@@ -279,6 +283,8 @@ class RecorderNode(FingerNode):
                 return
             number += 1
             stamp = first + later
+            if not self._is_time(topic, stamp):
+                continue
             if track.run == self.run and number == track.sequence.next > 1:
                 # Nearly all do go on, and what is saved here is left to the loop.
                 track.sequence.count(number)
@@ -296,9 +302,21 @@ class RecorderNode(FingerNode):
                 self._tell_time(max(stamp, self.newest, 1))
             self._put(track, stamp, data)
 
+    def _is_time(self, topic: str, stamp: int, end: int = STAMPS_END) -> bool:
+        """Say whether a time stamp (ns) is in [0, end), and complain of one that is not."""
+        if 0 <= stamp < end:
+            return True
+        self.get_logger().error(
+            f"'{topic}' is stamped {stamp * 1e-9:g} s, must be in [0, {end * 1e-9:g}) s; not recorded",
+            throttle_duration_sec=1.0,
+        )
+        return False
+
     def _put(self, track: Track, stamp: int, data: bytes) -> None:
         """Write a message at `stamp` (ns in the bag)."""
         assert self.writer is not None
+        if not self._is_time(track.connection.topic, stamp, BAG_END):
+            return
         try:
             self.writer.write(track.connection, stamp, data)
         except OSError as error:

@@ -57,8 +57,15 @@ class TemperatureNode(FingerNode):
         if self.next == 0 and self.temperatures.get_subscription_count() < p.subscribers:
             return  # the cantilever asks again
         now = message.clock.sec + message.clock.nanosec * 1e-9
-        if now <= self.last_clock:
-            self.next = math.floor(now / p.period + 1e-9)
+        if now < 0.0:
+            self.get_logger().error(
+                f"'clock' is {now:g} s, must be at least 0 s; ignored", throttle_duration_sec=1.0
+            )
+            return
+        place = math.floor(now / p.period + 1e-9)
+        # Nobody waits for what lies before a clock that leaps ahead; to send it all may never end.
+        if now <= self.last_clock or place > self.next:
+            self.next = place
         self.last_clock = now
         end = math.floor((now + p.ahead) / p.period + 1e-9) + 1
         self._publish(end)
