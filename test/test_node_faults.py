@@ -269,6 +269,17 @@ def test_the_fault_of_a_block_is_one_of_the_finger_and_stays_until_both_are_rese
         assert states[-1].since.sec == states[-1].times == 0
 
 
+def test_the_fault_of_a_block_that_is_gone_or_never_was_can_be_reset(neighbour, tmp_path):
+    with node("cantilever", tmp_path):
+        states = neighbour.listen(FingerState, "state", LATCHED)
+        faults = neighbour.node.create_publisher(Fault, "fault", FAULTS)
+        fault = Fault(node="nobody", text="saw\n\nnothing")
+        neighbour.insist(faults, fault, lambda: states and states[-1].phase == FingerState.FAULT)
+        assert states[-1].text == "nobody: saw nothing"
+        assert reset(neighbour, "cantilever").success
+        neighbour.wait(lambda: states[-1].phase == FingerState.WAITING)
+
+
 @pytest.mark.shows("a publisher of an input that cannot be heard (quality of service)")
 def test_a_publisher_that_cannot_be_heard_is_named(neighbour, tmp_path):
     """Best effort, as sensors often publish, where reliable is asked for: nothing would ever arrive."""
@@ -409,6 +420,10 @@ def test_a_controller_changes_as_a_whole_or_not_at_all(neighbour, tmp_path):
         path.write_text(yaml.safe_dump({"/**/feedback": {"ros__parameters": second}}))
         assert neighbour.set("feedback", controller_file=str(path)).successful
         neighbour.wait(lambda: neighbour.get("feedback", "name") == "b")
+        assert list(neighbour.get("feedback", "a")) == second["a"]
+        path.write_text("{")  # the same name again, and no controller any more
+        answer = neighbour.set("feedback", controller_file=str(path))
+        assert not answer.successful and "b.yaml" in answer.reason
         assert list(neighbour.get("feedback", "a")) == second["a"]
         answer = neighbour.set("feedback", controller_file="robsut")
         assert not answer.successful and "robust" in answer.reason

@@ -125,7 +125,7 @@ class BlockNode(FingerNode):
 
     def _tell(self) -> None:
         """Say on `fault` and `/diagnostics` what is latched."""
-        fault = Fault(node=self.NAME, times=self.guard.times)
+        fault = Fault(node=self.get_name(), times=self.guard.times)
         if self.guard.is_latched:
             fault.text = self.guard.cause
         fault.header.stamp = base.wall_time(self.guard.since)

@@ -27,6 +27,7 @@ import time
 from collections.abc import Set
 from typing import Any
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -92,6 +93,8 @@ class FeedbackNode(BlockNode):
         self._is_held = False
         """Whether the finger is where the last answer left it, while this node is inactive."""
         self._file = ""
+        self._unreadable = ""
+        """Why the file of the controller that is asked for cannot be taken."""
         self.add_pre_set_parameters_callback(self._with_file)
         self._begin_with_file()
         self.restart_law()
@@ -108,6 +111,13 @@ class FeedbackNode(BlockNode):
     def refuses_while_active(self, names: set[str]) -> set[str]:
         fixed = {"mode", "subscribers", "age_limit", "force_control"}
         return {name for name in names if name in fixed or name.startswith("touch.")}
+
+    def _validate(self, changes: list[Parameter]) -> SetParametersResult:
+        # The name of a file may stay, and what stands in it not.
+        reason, self._unreadable = self._unreadable, ""
+        if reason:
+            return SetParametersResult(successful=False, reason=reason)
+        return super()._validate(changes)
 
     def check(self, parameters: FeedbackNodeParameters) -> None:
         """Refuse the half of a controller, and one that cannot take over where the loop is."""
@@ -311,8 +321,9 @@ class FeedbackNode(BlockNode):
             return changes
         try:
             controller = flatten(successor(path, self.parameters))
-        except ParameterError:
-            return changes  # `check` says why
+        except ParameterError as error:
+            self._unreadable = str(error)
+            return changes
         types = {n: base.parameter_type(self.PARAMETERS, n) for n in controller.keys() - values}
         return [*changes, *(Parameter(n, kind, controller[n]) for n, kind in types.items())]
 

@@ -144,6 +144,10 @@ class CantileverNode(FingerNode):
         """Leave a fault: a new run in lock-step; running free, voltages count again."""
         if not self.guard.is_latched:
             return
+        # Who is gone, or never was, resets nothing any more.
+        present = self.get_node_names_and_namespaces()
+        own = self.get_namespace()
+        self.faults = {name: text for name, text in self.faults.items() if (name, own) in present}
         if self.parameters.mode == "lockstep":
             self.start()
         else:
@@ -174,7 +178,7 @@ class CantileverNode(FingerNode):
         """Take note of what a block of the loop has latched."""
         self.faults.pop(fault.node, None)
         if fault.text:
-            self.faults[fault.node] = fault.text
+            self.faults[fault.node] = " ".join(fault.text.split())
             self._look_around()
 
     def _look_around(self) -> None:
