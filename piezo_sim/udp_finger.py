@@ -29,7 +29,7 @@ from piezo_control.compiled import compiled
 from piezo_control.files import write_json
 from piezo_control.options import output_file, port, within
 from piezo_control.parameters import ParameterError, build, load
-from piezo_control.safety import RAMP_PERIOD, SafetyParameters, toward
+from piezo_control.safety import RAMP_PERIOD, SafetyParameters, VoltageParameters, toward
 from piezo_control.servo.clock import Clock, become_real_time, clock_of, now
 from piezo_control.start import stop_at_signals
 from piezo_sim.driver import Device, device_of, read, write
@@ -37,6 +37,8 @@ from piezo_sim.plant.cantilever import CantileverParameters
 
 PORT = 9750
 WORD, ASKS = struct.unpack("<qq", b"PZG1\0\0\0\0PZG?\0\0\0\0")
+CARD = {"amplifier.slew_limit": VoltageParameters().slew_limit}
+"""Of a cantilever whose file has none."""
 SIZE = 24  # bytes of a datagram: word, number, value
 
 _recvfrom: Any = types.ExternalFunction(
@@ -269,9 +271,7 @@ def main() -> int:
                 f"--scale is {arguments.scale:g}, must be finite and not 0; --zero is {arguments.zero:g}, must be finite"
             )
         file = arguments.cantilever
-        plant = CantileverParameters()
-        if file:
-            plant = build(CantileverParameters, load(file, "cantilever"), file)
+        plant = build(CantileverParameters, CARD | (load(file, "cantilever") if file else {}), file)
         finger = UdpFinger(
             plant, arguments.host, arguments.port, None, arguments.priority, arguments.scale,
             arguments.zero,

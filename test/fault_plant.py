@@ -19,17 +19,18 @@ FARTHEST = 66e-6  # m: where a step over the whole reach of 44 µm overshoots to
 class Witness(Cantilever):
     """A cantilever that looks at every sample: limits, slew in time, finite numbers.
 
-    The voltage comes from a feedforward, limited to `STANDS.slew_limit`; running free, messages may come in
-    a burst, and it is the amplifier that keeps the slew in time. What the feedforward asks for may be no
-    further away than it could lead the voltage while a message or a `state` was on its way.
+    The amplifier keeps the slew in time, whoever asks. The voltage comes from a feedforward, limited to
+    `STANDS.slew_limit`: in lock-step in each sample; running free, messages may come in a burst, and what it asks for
+    may be no further away than it could lead the voltage while a message or a `state` was on its way.
     """
 
     def __init__(self, parameters):
         super().__init__(parameters)
-        slew = STANDS.slew_limit
-        if parameters.mode == "free_running":
-            slew = parameters.amplifier.slew_limit
-        self.largest_step = slew * parameters.sample_time * (1 + 1e-9)
+        rounding = parameters.sample_time * (1 + 1e-9)
+        self.largest_step = parameters.amplifier.slew_limit * rounding
+        self.led_step = math.inf  # running free, what is asked for is looked at when it comes
+        if parameters.mode == "lockstep":
+            self.led_step = STANDS.slew_limit * rounding
 
     def advance(self, voltage, temperature_degc, tip_force=0.0):
         before = self.voltage
@@ -39,6 +40,8 @@ class Witness(Cantilever):
             self.say(f"{now} V")
         if not abs(now - before) <= self.largest_step:
             self.say(f"{before} V to {now} V in one sample, allowed are {self.largest_step} V")
+        elif not abs(now - before) <= self.led_step:
+            self.say(f"a {LEAP} of {before} V to {now} V in one sample, {self.led_step} V are led")
         if not (math.isfinite(self.deflection) and abs(self.deflection) <= FARTHEST):
             self.say(f"deflection {self.deflection} m")
 

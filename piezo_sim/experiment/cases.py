@@ -26,6 +26,7 @@ from piezo_control.profile import Profile
 from piezo_control.safety import LARGEST_DEFLECTION, LARGEST_FORCE, LARGEST_VOLTAGE
 from piezo_control.shared import shared_folder
 from piezo_sim.nodes.parameters import CantileverNodeParameters, TemperatureNodeParameters
+from piezo_sim.plant.amplifier import AmplifierParameters
 from piezo_sim.plant.sensor import SensorParameters
 
 NODES = {
@@ -44,8 +45,6 @@ COMPENSATORS = {
     "feedback": "",
 }
 """Mode of a case to compensator of its feedforward; empty: that of the parameter file, or the inverse."""
-STEEP = 4e5
-"""Slew limit (V/s) without feedback: the paper's step of the voltage, 40 V, takes one sample of 0.1 ms."""
 HOLDING = ("thermal", "force")
 """Analyses that need no motion."""
 NO_FORCE = {"shape": "step", "amplitude_mn": 0.0}
@@ -127,7 +126,12 @@ class Case:
                 "compensator": compensator,
                 "temperature_lockstep": is_warm,
                 "temperature_period": grid,
-                **({} if self.mode == "feedback" else {"slew_limit": STEEP}),
+                # Without feedback the paper's steps are as steep as the amplifier goes.
+                **(
+                    {}
+                    if self.mode == "feedback"
+                    else {"slew_limit": AmplifierParameters().slew_limit}
+                ),
             },
             "feedback": {"subscribers": 2},
             "temperature": {
@@ -145,7 +149,6 @@ class Case:
                 "temperature_lockstep": True,
                 "temperature_period": grid,
                 "clock_period": 10 * grid,
-                **({} if self.mode == "feedback" else {"amplifier.slew_limit": STEEP}),
             },
         }
         if self.mode == "feedback":

@@ -19,6 +19,10 @@ from piezo_control.safety import VoltageParameters, limited
 class AmplifierParameters(VoltageParameters):
     """Limits of the voltage amplifier, the last thing between a voltage and the finger."""
 
+    slew_limit: float = parameter(
+        # The paper's step of the voltage, 40 V, takes one sample of 0.1 ms.
+        4e5, "fastest change of the output", unit="V/s", low=1e-3, high=1e12,
+    )  # fmt: skip
     bandwidth_hz: float = parameter(
         0.0, "cut-off of the first-order lag; 0: unlimited", unit="Hz", low=0.0, high=1e9
     )
