@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import random
 import subprocess
@@ -28,6 +29,7 @@ from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 NODES = ("feedforward", "feedback", "cantilever")
 SENDERS = {"deflection": "cantilever", "command": "feedback", "voltage": "feedforward"}
 STANDS = VoltageParameters()
+CATCHING_UP = 3.0  # s after which one that stood still has done what was due
 SLEW = 1e3  # V/s of the amplifier, running free, where 40 V/ms is no limit at 5 ms a sample
 
 
@@ -142,6 +144,12 @@ class Bench:
     missing: list[tuple[str, ...]] = field(default_factory=list)
     """Words, of each entry of which the logs must have one; kept while one kind of event alone was at work."""
     violations: list[str] = field(default_factory=list)
+    seen: list[tuple[float, int, float]] = field(default_factory=list)
+    """Deflections as published: s on the steady clock, number, m."""
+    halts: dict[str, float] = field(default_factory=dict)
+    """Node to the time (s) at which it was made to stand still last."""
+    ends: list[tuple[str, float]] = field(default_factory=list)
+    """Nodes that were ended, and when (s): killed in their sleep, as soon as they slept."""
     samples: int = 0
     number: int = -1
     deflection: float = 0.0
@@ -177,6 +185,13 @@ class Bench:
             self.executor.spin_once(timeout_sec=0.02)
         return True
 
+    def end(self, name: str, number: int) -> None:
+        """Send a signal that ends a process."""
+        now = time.monotonic()
+        slept = self.halts.get(name, -math.inf)
+        self.ends.append((name, slept if now - slept < CATCHING_UP else now))
+        self.processes.running[name].send_signal(number)
+
     def broken(self, text: str) -> None:
         if text not in self.violations:
             self.violations.append(text)
@@ -205,6 +220,7 @@ class Bench:
         if "deflection" in self.foreign:
             return
         self.samples += 1
+        self.seen.append((time.monotonic(), sample.number, sample.value))
         self.deflection = sample.value
         if self.lockstep:
             if self.number >= 0 and sample.number not in (0, self.number, self.number + 1):
@@ -223,11 +239,15 @@ def finger(
     lockstep: bool,
     linked: str,
     misfit: bool,
+    is_recorded: bool,
     network: Network | None,
     draw: random.Random,
     folder: Path,
 ) -> Iterator[Bench]:
-    """Start the nodes of a finger in lock-step with a controller, or running free without one."""
+    """Start the nodes of a finger in lock-step with a controller, or running free without one.
+
+    Where it `is_recorded` a recorder writes its deflection into `folder`/bag.
+    """
     arguments = {name: ["--ros-args"] for name in NODES}
     if lockstep:
         arguments["feedback"] += ["--params-file", str(params_folder() / "feedback_robust.yaml")]
@@ -238,6 +258,14 @@ def finger(
         arguments["cantilever"] += ["-p", f"amplifier.slew_limit:={SLEW}", "-p", f"ramp:={LED}"]
     if linked:
         arguments[SENDERS[linked]] += ["-r", f"{linked}:={linked}_sent"]
+    if is_recorded:
+        arguments["recorder"] = [
+            "--ros-args",
+            "-p",
+            f"bag:={folder / 'bag'}",
+            "-p",
+            "topics:=[deflection]",
+        ]
     # Another network is reached beyond this machine's own loopback.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "SUBNET" if network else "LOCALHOST"
     rclpy.init()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import signal
+import time
 
 from fault_bench import NODES, Bench
 from lifecycle_msgs.msg import Transition
@@ -42,7 +43,9 @@ PARAMETERS = (
 
 def halt(bench: Bench) -> None:
     """A process stands still for a while."""
-    process = bench.processes.running[bench.draw.choice(NODES)]
+    name = bench.draw.choice([*bench.processes.running])
+    process = bench.processes.running[name]
+    bench.halts[name] = time.monotonic()
     process.send_signal(signal.SIGSTOP)
     bench.wait(bench.draw.choice((0.02, 0.3, 1.0)))
     process.send_signal(signal.SIGCONT)
@@ -65,16 +68,16 @@ def hurry(bench: Bench) -> None:
 
 def end(bench: Bench) -> None:
     """A process ends by a signal."""
-    name = bench.draw.choice(NODES)
+    name = bench.draw.choice([*bench.processes.running])
     bench.ended.add(name)
-    bench.processes.running[name].send_signal(bench.draw.choice(SIGNALS))
+    bench.end(name, bench.draw.choice(SIGNALS))
 
 
 def restart(bench: Bench) -> None:
     """A process ends, and is started again while DDS may still believe in the first one."""
     name = bench.draw.choice(NODES)
     process = bench.processes.running[name]
-    process.send_signal(bench.draw.choice(SIGNALS))
+    bench.end(name, bench.draw.choice(SIGNALS))
     if not bench.wait(10.0, lambda: process.poll() is not None):
         process.kill()  # nohup and shells let their children ignore some signals
         process.wait()

@@ -18,6 +18,7 @@ import random
 import shutil
 import subprocess
 import sys
+import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
@@ -29,10 +30,13 @@ from fault_plant import LEAP
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from std_srvs.srv import Trigger
 
+from piezo_control.recording.reader import open_bag
+from piezo_control.recording.recording import SAMPLE_TYPE
 from piezo_gripper_msgs.msg import FingerState, Sample
 
 TRACEBACK = "Traceback (most recent call last):\n"
 START = 60.0  # s that the loop may take to run on a busy machine
+AT_RISK = 1.0  # s before the end of a process that need not be in a bag
 OUTCOME = 30.0  # s until it tracks again or a fault is latched and named
 TARGET = 1e-5  # m
 NEAR = {True: 0.5e-6, False: 3e-6}  # m: with a controller; without, creep and warmth are not undone
@@ -71,10 +75,11 @@ def play(seed: int, folder: Path) -> list[str]:
     misfit = bool(linked) and draw.random() < 0.1
     is_loaded = draw.random() < 0.3
     is_apart = not linked and draw.random() < 0.2  # drawn alike on every machine
+    is_recorded = not is_apart and linked != "deflection" and draw.random() < 0.6
     with contextlib.ExitStack() as stack:
         network = stack.enter_context(Network()) if is_apart and has_networks() else None
         bench = stack.enter_context(
-            fault_bench.finger(lockstep, linked, misfit, network, draw, folder)
+            fault_bench.finger(lockstep, linked, misfit, is_recorded, network, draw, folder)
         )
         if misfit:
             has_ended = bench.wait(START, lambda: bench.finger.phase in CLOSED)
@@ -86,7 +91,10 @@ def play(seed: int, folder: Path) -> list[str]:
         processes = dict(bench.processes.running)
         finger = bench.finger
         foreign = bench.foreign
+        bench.ends += [(name, time.monotonic()) for name in processes]
     violations += [f"{n} is left behind" for n, p in processes.items() if p.poll() is None]
+    if is_recorded and "deflection" not in foreign:
+        violations += lost(bench, folder / "bag")
     logs = {path.stem: path.read_text(errors="replace") for path in folder.glob("*.log")}
     for name, words in logs.items():
         # A signal may come while Python itself starts, before a line of this package can do anything about it.
@@ -106,6 +114,29 @@ def play(seed: int, folder: Path) -> list[str]:
     if finger.phase == FingerState.FAULT and finger.text.split(": ")[-1] not in everything:
         violations.append(f"no log says '{finger.text}'")
     return violations
+
+
+def lost(bench: Bench, path: Path) -> list[str]:
+    """Say which deflections the bag lacks that a recorder had the time to write.
+
+    It has everything of a run from the first sample on that reached it, but for the last second of a cantilever, or
+    of its own.
+    """
+    if not path.exists():
+        return []  # it was ended before it began
+    recorded = {(s.number, s.value) for s in open_bag(path).messages("/deflection", SAMPLE_TYPE)}
+    end = min(instant for name, instant in bench.ends if name == "recorder") - AT_RISK
+    breaks = [instant for name, instant in bench.ends if name == "cantilever"]
+    missing, is_heard, before = [], False, -1
+    for instant, number, value in bench.seen:
+        is_heard = (number, value) in recorded or is_heard and number >= before
+        before = number
+        is_at_risk = instant > end or any(0.0 <= b - instant < AT_RISK for b in breaks)
+        if is_heard and not is_at_risk and (number, value) not in recorded:
+            missing.append(number)
+    if not missing:
+        return []
+    return [f"{len(missing)} of {len(bench.seen)} samples are not in the bag, as {missing[:5]}"]
 
 
 def is_overloaded() -> bool:
