@@ -371,9 +371,15 @@ def reachable_range(operator: Coefficients, low: float, high: float) -> tuple[fl
     Beyond them the inverse would go on at the outermost slope 1/W_n, unsupported by any data.
     """
     state = at_rest(operator)
-    # Each voltage twice: at rest, thresholds that depend on the rate are the plain ones.
-    ends = [operator_step(operator, state, voltage) for voltage in 2 * (low, low, high, high)]
-    return ends[5], ends[7]
+
+    def arrive(voltage: float) -> float:
+        operator_step(operator, state, voltage)
+        # Once more: at rest, thresholds that depend on the rate are the plain ones.
+        return operator_step(operator, state, voltage)
+
+    for voltage in (low, high):
+        arrive(voltage)
+    return arrive(low), arrive(high)
 
 
 REACH = reachable_range(
