@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile, qos_profile_sensor_data
 
 from piezo_control.nodes.qos import LATCHED, SAMPLE, SETPOINT
 from piezo_control.safety import VoltageParameters
-from piezo_gripper_msgs.msg import FingerState, Sample
+from piezo_gripper_msgs.msg import FingerState, RecorderState, Sample
 from piezo_sim.experiment.cases import params_folder
 from piezo_sim.experiment.on_nodes.processes import NodeProcesses
 
@@ -146,6 +146,8 @@ class Bench:
     violations: list[str] = field(default_factory=list)
     seen: list[tuple[float, int, float]] = field(default_factory=list)
     """Deflections as published: s on the steady clock, number, m."""
+    recorded: list[tuple[float, int]] = field(default_factory=list)
+    """How many of them the recorder had written, and when (s) it said so."""
     halts: dict[str, float] = field(default_factory=dict)
     """Node to the time (s) at which it was made to stand still last."""
     ends: list[tuple[str, float]] = field(default_factory=list)
@@ -165,6 +167,7 @@ class Bench:
             self.link = Link(self, self.linked, qos_profile_sensor_data if self.misfit else SAMPLE)
         self.node.create_subscription(FingerState, "state", self._on_state, LATCHED)
         self.node.create_subscription(Sample, self.sent("deflection"), self._on_deflection, SAMPLE)
+        self.node.create_subscription(RecorderState, "recorder_state", self._on_recorded, LATCHED)
         self.node.create_subscription(Sample, self.sent("voltage"), self._on_voltage, SAMPLE)
         self.reference = self.node.create_publisher(Sample, "reference", SETPOINT)
 
@@ -226,6 +229,9 @@ class Bench:
             if self.number >= 0 and sample.number not in (0, self.number, self.number + 1):
                 self.broken(f"deflection {sample.number} after {self.number}")
             self.number = sample.number
+
+    def _on_recorded(self, state: RecorderState) -> None:
+        self.recorded.append((time.monotonic(), sum(state.recorded)))
 
     def _on_voltage(self, sample: Sample) -> None:
         if "voltage" not in self.foreign and not (

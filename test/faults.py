@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import functools
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -128,21 +129,22 @@ def play(seed: int, folder: Path) -> list[str]:
 def lost(bench: Bench, path: Path) -> list[str]:
     """Say which deflections the bag lacks that a recorder had the time to write.
 
-    It has everything of a run from the first sample on that reached it, but for the last second of a cantilever, or
-    of its own.
+    It has everything from the moment on at which it says that it writes what a cantilever sends, but for the last
+    second of that, or of its own.
     """
     if not path.exists():
         return []  # it was ended before it began
     recorded = {(s.number, s.value) for s in open_bag(path).messages("/deflection", SAMPLE_TYPE)}
-    end = min(instant for name, instant in bench.ends if name == "recorder") - AT_RISK
-    breaks = [instant for name, instant in bench.ends if name == "cantilever"]
-    missing, is_heard, before = [], False, -1
-    for instant, number, value in bench.seen:
-        is_heard = (number, value) in recorded or is_heard and number >= before
-        before = number
-        is_at_risk = instant > end or any(0.0 <= b - instant < AT_RISK for b in breaks)
-        if is_heard and not is_at_risk and (number, value) not in recorded:
-            missing.append(number)
+    own_end = min(instant for name, instant in bench.ends if name == "recorder")
+    missing, begin = [], 0.0
+    for end in (instant for name, instant in bench.ends if name == "cantilever"):
+        before = max((count for instant, count in bench.recorded if instant < begin), default=0)
+        hears = (i for i, count in bench.recorded if i > begin and count > before)
+        heard, at_risk = next(hears, math.inf), min(end, own_end) - AT_RISK
+        missing += [
+            n for i, n, value in bench.seen if heard < i < at_risk and (n, value) not in recorded
+        ]
+        begin = end + AT_RISK  # what was still on its way is there by then
     if not missing:
         return []
     return [f"{len(missing)} of {len(bench.seen)} samples are not in the bag, as {missing[:5]}"]
