@@ -725,13 +725,18 @@ def test_what_changes_between_two_loops_is_no_leap_at_a_card_that_does_not_say(
     assert math.isnan(run())
 
 
-def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):
+def fail_above_rest(node):
+    """Let the device fail when the finger is up, and the node be deactivated then."""
     assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
     node.servo.refer(Profile([0.0], [5e-6]))
     node.until(lambda state: state.voltage > 1.0)
     node.card.device.answer[0] = FAILED
     node.trigger_deactivate()
     node.until(lambda state: state.phase == FingerState.IDLE)
+
+
+def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):
+    fail_above_rest(node)
     assert (
         "the device failed; its voltage may not be at rest: bus error: left at"
         in node.heard[-1].text
@@ -744,12 +749,7 @@ def test_a_device_that_dies_is_told_by_a_node_that_is_not_active(node):
 def test_a_finger_that_was_left_somewhere_is_not_taken_to_be_at_rest(node, says):
     """Whether its hardware went to rest by itself only the driver or somebody who looks can tell; it leaped by 20 V."""
     node.card = Card(0.0, says)
-    assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
-    node.servo.refer(Profile([0.0], [5e-6]))
-    node.until(lambda state: state.voltage > 1.0)
-    node.card.device.answer[0] = FAILED
-    node.trigger_deactivate()
-    node.until(lambda state: state.phase == FingerState.IDLE)
+    fail_above_rest(node)
     left = float(node.card.device.output[0])
     node.card.device.answer[0] = FRESH
     if says:
